@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exceptions for users, warnings, and texts for their messages. The command line prints an exception as one line, and
-ends with its exit status."""
+"""Exceptions for users, warnings, and texts for their messages.
+
+The command line prints an exception as one line, and ends with the exception's `exit_status`."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ class ClsplatError(Exception):
 
 
 def plain(text: str) -> str:
-    """`text` as one line that any terminal can print, since names in hostile files may contain any character."""
+    """Escape characters that are not printable, such as line breaks, since names in hostile files may contain them."""
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
 
 
@@ -111,7 +112,7 @@ class DeviceError(InputError):
 
 @contextmanager
 def of_argument() -> Iterator[None]:
-    """Context in which the messages of DeviceErrors name the Python argument `device`, not the flag --device."""
+    """Context manager: make the messages of DeviceErrors name the Python argument `device`, not the flag --device."""
     try:
         yield
     except DeviceError as error:

@@ -33,7 +33,7 @@ class RemainingTime(Protocol):
     """An estimator of the remaining time, for `TrainProgress` (`training.forecast.Forecast`)."""
 
     def see(self, report: Any) -> None:
-        """Update the estimate with a `training.loop.StepReport`."""
+        """Update the estimate of the remaining time with a `training.loop.StepReport`."""
 
     def left(self) -> float | None:
         """Seconds from the last report to the end, or None if they cannot be estimated yet."""
@@ -65,7 +65,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # rich estimates the remaining time of frames, which take similar times. Training adds its own estimate.
+            # `rich` estimates the remaining time of frames, which take similar times. Training adds its own estimate.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -85,7 +85,7 @@ class _Bar:
 
 
 class TrainProgress(_Bar):
-    """Progress of a training of `total` steps. Call it with each `training.loop.StepReport`, every step or less often.
+    """Progress of a training of `total` steps. Call it with a `training.loop.StepReport` after some or all steps.
 
     forecast: estimates the remaining time. Without it the remaining steps are assumed to take as long as the last ones.
     """
@@ -153,7 +153,7 @@ class TrainProgress(_Bar):
 
 
 class StageProgress:
-    """Progress of work in named stages. Call it with the stage and the fraction done, or None if unknown.
+    """Progress of work in named stages. Call it with the stage's name and the fraction done, or None if unknown.
 
     A `CountedFraction` is reported as a count. The last report of a stage is always shown.
     after: seconds at the start during which nothing is printed, for work that is usually quick.
@@ -232,9 +232,10 @@ class FrameProgress(_Bar):
         print(text, file=self.lines, flush=True)
 
     def _left(self) -> str:
-        """Text of the remaining time, from the mean time of the written frames; empty if under half a second.
+        """Return a text with the remaining time, or an empty text if that is less than half a second.
 
-        From the second frame on, the mean leaves out the first, during which kernels may have been built.
+        The estimate is the mean time of a written frame times the number of frames left. As soon as two frames are
+        written, the mean leaves out the first one, because kernels may have been built during it.
         """
         now = time.monotonic()
         if self.written == 1:

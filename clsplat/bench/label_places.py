@@ -76,8 +76,9 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
 
 
 def _candidates(point: Float64, size: Float64) -> Float64:
-    """Return candidate boxes (candidates, 4) for a label of this size around a point, ring by ring from the inside.
+    """Return the candidate boxes (RING_COUNT * DIRECTIONS_PER_RING, 4) for a label near a point, nearest ring first.
 
+    point: (2,), and size: (2,), the label's width and height, in pixels.
     Each box lies outside its ring and touches it, in one of DIRECTIONS_PER_RING directions.
     """
     angles = 2 * pi * np.arange(DIRECTIONS_PER_RING) / DIRECTIONS_PER_RING
@@ -88,7 +89,7 @@ def _candidates(point: Float64, size: Float64) -> Float64:
 
 
 def _nearest(boxes: Float64, points: Float64) -> Float64:
-    """Return the position in each box that is nearest to the point."""
+    """Return the position (..., 2) in each box (..., 4) that is nearest to the box's point (..., 2)."""
     return points.clip(boxes[..., :2], boxes[..., 2:])
 
 
@@ -121,6 +122,6 @@ def _cross(segments: Float64, others: Float64) -> NDArray[np.bool_]:
 
 
 def _sides(lines: Float64, points: Float64) -> Float64:
-    """Side of a line (m, 2, 2) on which a point (n, 2) lies, (m, n): positive on the left, negative on the right."""
+    """Return numbers (m, n): positive where a point (n, 2) is left of a line (m, 2, 2), negative where it is right."""
     along, offsets = (lines[:, 1] - lines[:, 0])[:, None], points - lines[:, None, 0]
     return along[..., 0] * offsets[..., 1] - along[..., 1] * offsets[..., 0]

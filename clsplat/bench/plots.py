@@ -86,7 +86,7 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
     rows.sort(key=lambda row: row[0][0])
     notes = ["Time without the switch divided by the time of exact, which has all of them. 1.00: no difference."]
     if (faster := result["exact_switches_faster"]) is not None:
-        notes.append(f"With all off: {faster['frame']:.2f} for a frame, {faster['iteration']:.2f} for a step.")
+        notes.append(f"With all switches off: {faster['frame']:.2f} for a frame, {faster['iteration']:.2f} for a step.")
     inches = max(0.42 * len(rows) + 0.2, 1.0)
     figure, axes = _sheet(["Gain of each exact switch", title], notes, inches)
     for index, (key, colour) in enumerate((("a frame", PLOT_BLUE), ("a training step", PLOT_ORANGE))):
@@ -129,7 +129,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
         f"{reference}: {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}.",
     ]
     if same:
-        notes.append(f"Approximate settings that give the same bits as exact here: {', '.join(same)}.")
+        notes.append(f"Approximate settings whose frame has the same bits as the exact preset's: {', '.join(same)}.")
     figure, axes = _sheet(["Time against error of the approximate settings", title], notes, 5.0)
     axes.set_xlabel("ms per frame, median", fontsize=FONT_SIZE_POINTS)
     axes.set_ylabel("PSNR, dB", fontsize=FONT_SIZE_POINTS)
@@ -180,7 +180,10 @@ def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _around(values: Sequence[float], below: float) -> tuple[float, float]:
-    """Return axis limits: the values' range, extended by 0.1 of its length above and by `below` of its length below."""
+    """Return the limits of an axis for these values: their range, extended at both ends.
+
+    The range is extended by 0.1 times its length at the upper end, and by `below` times its length at the lower end.
+    """
     span = max(values) - min(values) or 1.0
     return min(values) - below * span, max(values) + 0.1 * span
 
@@ -196,9 +199,10 @@ def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 def _label_points(
     figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]]
 ) -> None:
-    """Write a text near each point, with a leader line if it is not next to the point. Texts avoid `lines`.
+    """Write a text near each point, with a leader line if the text is not next to the point.
 
-    The axes must already have their final position and limits.
+    points: the points in the coordinates of `axes`, which must already have its final position and limits.
+    lines: both ends of each line that texts should not cross, in the same coordinates.
     """
     to_pixels, to_figure = axes.transData.transform, figure.transFigure.inverted().transform
     bounds = axes.get_window_extent()

@@ -35,17 +35,18 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Name of the setting with all exact switches off. A switch with several values has the one that skips least work."""
+"""Name of the setting with all exact switches off. Of several values, a switch takes the one that skips least work."""
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings that are approximate unless they have the preset exact's value. Of `extent`, only 3sigma is approximate."""
+"""Fields of `RasterizerConfig` of which any value is approximate except that of the preset `exact`. The field `extent`,
+which is not listed, is approximate only if it is "3sigma"."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
-    """PSNR in dB over all pixels and channels, at most MAX_PSNR_DB, and largest absolute difference.
+    """Compare two images. Returns their "psnr" in dB, at most MAX_PSNR_DB, and "max_abs", their largest difference.
 
-    Both are computed in float64, without clamping.
+    Both are over all pixels and channels, in float64, without clamping.
     """
     difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
     mse = float(np.mean(np.square(difference)))
@@ -54,9 +55,10 @@ def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
 
 
 def settings() -> dict[str, BenchSwitches]:
-    """Return the settings to measure, by name: presets, the defaults with one switch changed, and all exact ones off.
+    """Return the settings to measure, by name.
 
-    Equal settings are measured once, with their names joined.
+    These are the presets, the defaults with one switch changed, and the defaults with all exact switches off.
+    Equal settings are listed once, with their names joined.
     """
     named = {f"preset {name}": config.switches() for name, config in RASTERIZER_PRESETS.items()}
     flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
@@ -100,6 +102,7 @@ def compare(
 ) -> dict[str, Any]:
     """Measure run time and error of each setting.
 
+    candidates: the settings by name; None measures `settings()`. repeat: number of rounds.
     Times are medians for a frame and for a training step. Each round measures all settings in turn.
     Errors are relative to the float64 reference in a crop, and to the frame of the exact preset in the full image.
     If the settings include exact and ALL_EXACT_SWITCHES_OFF, the result also has the ratio of their times.
@@ -263,8 +266,8 @@ def settings_table(result: dict[str, Any]) -> str:
         rows.append((point["name"], *times, psnr, f"{point['max_abs']:.2g}", front_mark))
     known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
     note = (
-        f"errors are against {result['error_is_against']}; exact against the float64 reference on {width}x{height} "
-        f"pixels: PSNR {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}"
+        f"errors are against {result['error_is_against']}; the exact preset against the float64 reference on "
+        f"{width}x{height} pixels: PSNR {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}"
     )
     lines = [*aligned(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:

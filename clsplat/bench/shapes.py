@@ -73,7 +73,10 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
 
 
 def choose(trials: list[Trial]) -> Shape:
-    """Choose the fastest shape if it is clearly faster than the default shape, the first trial; else the default."""
+    """Return the fastest shape if it is clearly faster than the default shape, otherwise the default shape.
+
+    trials: the first trial is of the default shape.
+    """
     default = trials[0]
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:

@@ -48,9 +48,9 @@ def bench(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure every stage. Returns the object that `clsplat bench --json` prints.
+    """Measure every stage of a frame and of a training step. Returns the object that `clsplat bench --json` prints.
 
-    The device's queue should have been created with profiling.
+    The device's queue should have been created with profiling, as kernels' times come from its events.
     """
     say = progress or no_progress
     config = (config or RasterizerConfig()).switches()
@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # for reduced SH, the frame needs a copy of the model
+    if held_kind(config) != held_kind(RasterizerConfig()):  # SH is stored in another form: upload a second model
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:
@@ -193,7 +193,7 @@ _VIEWS = 8
 
 @dataclass(frozen=True, eq=False)
 class _Picture(View):
-    """View that returns the photograph `pixels`, which is in memory, for every size."""
+    """View with one photograph, the array `pixels` (H, W, 3 or 5), whatever size is requested."""
 
     pixels: Float32 = field(kw_only=True)
 
@@ -250,7 +250,7 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
         f"{result['source']}: {seen}, at {size}",
-        f"pairs: {pairs['listed']:,} of a tile and a Gaussian; of a pixel and a Gaussian, {of_pixels}",
+        f"(tile, Gaussian) pairs: {pairs['listed']:,}; (pixel, Gaussian) pairs: {of_pixels}",
         f"limits: {most}, {copying:.1f} GB/s for copying",
         "",
     ]

@@ -102,7 +102,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """Return a copy of the Gaussians with origin zero, and a camera without rotation that sees nine tenths of them."""
+    """Return a copy of the Gaussians with origin zero, and a camera without rotation that sees most of them."""
     low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
     focal = 0.9 * width
     half = np.maximum(high - middle, middle - low)

@@ -23,9 +23,10 @@ def shape_like(array: Any) -> jax.ShapeDtypeStruct:
 
 
 def on_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any:
-    """Call a function of NumPy arrays from a JAX program. Under `vmap` it is called for each element.
+    """Call `function` of NumPy arrays from a JAX program, and return its result as JAX arrays.
 
     shapes: shapes and dtypes of the result, a tree of jax.ShapeDtypeStruct.
+    arguments: JAX arrays. Under `vmap` the function is called once for each element of the mapped axis.
     """
 
     def called(*given: Any) -> Any:

@@ -148,7 +148,7 @@ def rasterize(
     check_given(covars, quaternions, scales)
     floats = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items() if array is not None}
     for name, side in (("viewmats", 4), ("intrinsics", 3)):
-        if floats[name].shape == (side, side):  # a single matrix, without the axis of cameras
+        if floats[name].shape == (side, side):  # one camera: add the axis of cameras
             floats[name] = floats[name][None]
     if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
         floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))
@@ -179,7 +179,7 @@ def _side(name: str, given: Any) -> int:
 
 @dataclass(frozen=True)
 class StaticArguments:
-    """The arguments of a call that are not arrays."""
+    """The arguments of `clsplat.jax.rasterize` that are not arrays. They are static under `jit`."""
 
     width: int
     height: int
@@ -196,7 +196,10 @@ class StaticArguments:
     device: Device | str | None
 
     def run(self, arrays: dict[str, Any]) -> Rasterization:
-        """Call `clsplat.rasterize`. arrays: NumPy arrays by argument name, without arguments that are None."""
+        """Call `clsplat.rasterize` with these settings and with arrays.
+
+        arrays: NumPy arrays by argument name. Names of arguments that are None are absent.
+        """
         return rasterize_numpy(
             arrays["means"],
             arrays.get("quaternions"),
@@ -223,7 +226,11 @@ class StaticArguments:
         )
 
     def shapes(self, arrays: dict[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes and dtypes of the results. Raises InputError for a wrong shape; it names the argument."""
+        """Return the shape and dtype of each result of `clsplat.rasterize`, by name.
+
+        arrays: the call's arrays by argument name, which may be tracers.
+        Raises InputError, which names the argument, for a wrong shape or setting.
+        """
         sizes = {name: array.shape for name, array in arrays.items()}
         checked_modes(self.render_mode, self.rasterize_mode, self.alpha_max)
         checked_planes(self.near_plane, self.far_plane, self.eps2d, self.radius_clip, self.camera_model)
@@ -270,7 +277,7 @@ class StaticArguments:
 
 
 class PendingForwards:
-    """Results of forward passes, by number, which are kept until their gradients are computed."""
+    """Results of forward passes, by the number of the pass. Each is kept until its gradient is computed."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -288,7 +295,7 @@ class PendingForwards:
         return np.int32(number)
 
     def pop(self, number: int) -> Rasterization | None:
-        """Remove and return the result of the pass with this number; None if it has been deleted."""
+        """Remove the result with this number, and return it; None if it has been deleted."""
         with self._lock:
             return self._results.pop(number, None)
 

@@ -109,7 +109,10 @@ class Gradients:
         self.intrinsics: list[Float64] = []
 
     def sh(self, device: Device) -> tuple[DeviceArray, bool]:
-        """Return the device array for a camera's SH gradient, and True if it holds the sum of earlier cameras."""
+        """Return the device array for the next camera's gradient with respect to the SH coefficients.
+
+        The second result is True if the array holds the sum of earlier cameras, to which the gradient is to be added.
+        """
         given = self.given
         add = bool(self.coefficients) and not given.by_camera
         if not add:
@@ -117,7 +120,10 @@ class Gradients:
         return self.coefficients[-1].array, add
 
     def by_name(self, *, cameras: bool) -> dict[str, Any]:
-        """Return the gradients on the host, by argument of `rasterize`. cameras: include viewmats and intrinsics."""
+        """Return the gradients on the host, by argument of `rasterize`.
+
+        cameras: True includes the gradients with respect to viewmats and intrinsics.
+        """
         found = {name: one.get() for name, one in self.room.hosted.items()}
         if self.given.shapes.covariance_layout == "full":
             found["covars"] = full_gradient(found["covars"])
@@ -219,7 +225,7 @@ class CameraPass:
         return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
 
     def splats(self, name: str) -> NDArray[Any]:
-        """Return an array of the projection, such as "means2d", by its name in `Ewa`."""
+        """Return an array of the projection: "means2d", "depths", "conics", "radii" or "compensations"."""
         with self._session.lock:
             return self.projected.get(name)
 
@@ -230,7 +236,7 @@ class CameraPass:
 
     @property
     def compensations(self) -> Float32 | None:
-        """Factors (N,) of the opacities that compensate for the low-pass filter; None without compensation."""
+        """Factors (N,) by which opacities compensate for the low-pass filter; None without compensation."""
         return None if self.projected.arrays.compensations is None else self.splats("compensations")
 
     @property
@@ -243,7 +249,7 @@ class CameraPass:
 
     @cached_property
     def alpha(self) -> Float32:
-        """Alpha (H, W), 0 to 1."""
+        """The image's alpha (H, W), 0 to 1."""
         return self.pixels.alpha
 
     @cached_property
@@ -289,7 +295,8 @@ class CameraPass:
     def add_gradients(self, gradients: Gradients, by: ViewGradients, *, cameras: bool) -> None:
         """Add this camera's gradients to `gradients`.
 
-        by: gradients with respect to the projected Gaussians. cameras: include view matrix and intrinsics.
+        by: gradients with respect to the projected Gaussians.
+        cameras: True includes the gradients with respect to the view matrix and the intrinsics.
         """
         session, given, device = self._session, self._given, self._session.device
         on_image, compensations = by.on_image, self.compensations
@@ -320,7 +327,8 @@ class CameraPass:
     ) -> DeviceArray | None:
         """Add the gradients of SH colours: with respect to coefficients, and through viewing directions to the means.
 
-        d_means: the array of means' gradients to add to. by_colour: (N, 3), gradient with respect to the colours.
+        d_means: (N, 3), gradient with respect to the means, to which this camera's is added.
+        by_colour: (N, 3), gradient with respect to the colours; None means 0.
         Returns the gradient with respect to the camera's centre if `cameras` is True.
         """
         session, count = self._session, self._given.count

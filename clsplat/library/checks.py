@@ -50,7 +50,10 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
-    """Convert one matrix or several to float64 (count, side, side). Raises InputError like `floats`."""
+    """Convert the argument `name`, one matrix or several, to float64 (count, side, side).
+
+    Raises InputError like `floats`.
+    """
     floats(name, given, (count, side, side), (side, side))
     array: Float64 = np.array(given, np.float64)  # copied, because the caller may change the array later
     return array.reshape(-1, side, side)
@@ -71,7 +74,10 @@ def whole(given: Any) -> int | None:
 
 
 def sizes(name: str, given: Any, count: int) -> list[int]:
-    """Return a length in pixels for each of `count` cameras, given one for all or one for each. Raises InputError."""
+    """Return the argument `name` as a list with a length in pixels for each of `count` cameras. Raises InputError.
+
+    given: one length for all cameras, or a sequence with one for each.
+    """
     each = [whole(size) for size in ([given] * count if np.ndim(given) == 0 else given)]
     lengths = [size for size in each if size is not None and 0 < size < 2**24]
     if not len(lengths) == len(each) == count:

@@ -34,9 +34,9 @@ Array = NDArray[Any] | DeviceArray
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """Projected Gaussians, and the lists of Gaussians in an image's tiles.
+    """Projected Gaussians, and for each tile of an image the list of its Gaussians.
 
-    first_slots: (n,), the first slot of each Gaussian.
+    first_slots: (n,), index of a Gaussian's first slot. A slot is the row that holds the gradient of a pair.
     """
 
     projected: Projected
@@ -67,7 +67,7 @@ class PixelGradients:
 class ListedPixels:
     """An image from projected Gaussians and tile lists. The object keeps memory for its gradient until it is deleted.
 
-    listing: function that makes the tile lists in arrays of a workspace, its argument.
+    listing: function that makes the tile lists. Its argument is the workspace that provides the arrays for them.
     gaussians, size, background, alpha_max, backward: as in `PixelPass`.
     """
 
@@ -130,8 +130,8 @@ class ListedPixels:
         d_alpha: (H, W), the gradient of the loss with respect to alpha; None means 0.
         absolute: also compute sums over pixels of absolute gradients.
         Returns gradients by name: means2d (n, 2), conics (n, 3), opacities (n,), colours (n, D), and background (D,) if
-        there is one. With `absolute` also absolute (n, 2): sums over pixels of the absolute gradients with respect to
-        means2d.
+        the pass has a background. With `absolute` also absolute (n, 2): sums over pixels of the absolute gradients
+        with respect to means2d.
         """
         found = self.gradient_on_device(d_image, d_alpha, absolute=absolute)
         with self._session.lock:
@@ -242,7 +242,11 @@ def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> Devic
 
 
 def listed_by_depth(device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int) -> Listed:
-    """List each tile's Gaussians for an image, front to back. Waits for the device. Raises CapacityError."""
+    """List the Gaussians of each tile of an image, front to back. Waits for the device.
+
+    work: workspace that provides the arrays of the lists. width, height: of the image, in pixels.
+    Raises CapacityError if the device has no memory for the (tile, Gaussian) pairs.
+    """
     projected = splats(device, work, gaussians, width, height)
     counted = count(device, work, projected)
     most = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)

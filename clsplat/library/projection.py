@@ -57,7 +57,10 @@ class ProjectedView:
         ewa(device, gaussians, self._camera, self.arrays)
 
     def get(self, name: str) -> NDArray[Any]:
-        """Return an array of the projection on the host, by its name in `Ewa`; not a copy. Waits for the device."""
+        """Return an array of the projection on the host, not as a copy. Waits for the device.
+
+        name: "radii", "means2d", "depths", "conics" or "compensations".
+        """
         return self._hosted[name].get()
 
     def gradient(
@@ -74,7 +77,10 @@ class ProjectedView:
 
 
 def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
-    """Upload gradients with respect to the arrays of `Ewa`. by: some or all of them, by the arrays' names."""
+    """Upload gradients with respect to projected Gaussians.
+
+    by: gradients by the names "means2d", "depths", "conics" and "compensations"; an absent one counts as 0.
+    """
 
     def at(name: str) -> DeviceArray | None:
         return from_host(device, by[name]) if name in by else None
@@ -83,7 +89,11 @@ def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradie
 
 
 class HostedGradients(NamedTuple):
-    """Gradients with respect to Gaussians: arrays on the device, and the same by argument name, to read on the host."""
+    """Gradients with respect to Gaussians.
+
+    arrays: the gradients on the device.
+    hosted: the same gradients by the argument's name, to be read on the host.
+    """
 
     arrays: EwaGradients
     hosted: dict[str, Hosted]
@@ -312,7 +322,12 @@ def checked_cameras(
 
 
 class CameraPlanes(NamedTuple):
-    """Camera settings that all cameras of a call share, in the order of the fields of `EwaCamera`."""
+    """Camera settings that all cameras of a call share.
+
+    near, far: depths in world units between which Gaussians are drawn.
+    eps2d: low-pass filter in px^2. radius_clip: radius in pixels up to which Gaussians are culled.
+    model: one of EWA_CAMERA_MODELS.
+    """
 
     near: float
     far: float
@@ -335,7 +350,7 @@ def checked_planes(
 
 
 def check_given(covars: object, quaternions: object, scales: object) -> None:
-    """Raise InputError unless either covars, or quaternions and scales, are given. The message names the argument."""
+    """Raise InputError unless the caller gave either covars, or both quaternions and scales. None means not given."""
     if covars is None and (quaternions is None or scales is None):
         missing = "quaternions" if quaternions is None else "scales"
         raise InputError(f"{missing} is None, expected an array unless covars is given")
@@ -359,7 +374,10 @@ class GivenShapes:
     def checked(
         cls, count: int, covars: ArrayLike | None, quaternions: ArrayLike | None, scales: ArrayLike | None
     ) -> GivenShapes:
-        """Check the arguments of a call. Raises InputError, which names the argument."""
+        """Check the shapes of Gaussians that a caller gave. Raises InputError, which names the argument.
+
+        count: number of Gaussians. covars: None if quaternions and scales are given.
+        """
         check_given(covars, quaternions, scales)
         if quaternions is not None and scales is not None:
             turns = floats("quaternions", quaternions, (count, 4))
@@ -373,7 +391,10 @@ class GivenShapes:
         return cls(covariances=np.ascontiguousarray(upper, np.float32), covariance_layout="full")
 
     def inputs(self, means: DeviceArray, opacities: DeviceArray | None) -> EwaInputs:
-        """Return the Gaussians as arrays on the device that holds `means`."""
+        """Return the inputs of the projection, with all arrays on the device that holds `means`.
+
+        means: (n, 3). opacities: (n,), by which bounding boxes are reduced; None for boxes of any opacity.
+        """
         quaternions, scales, covariances = (
             None if array is None else from_host(means.device, array)
             for array in (self.quaternions, self.scales, self.covariances)
@@ -390,7 +411,7 @@ def full_gradient(upper: Float32) -> Float32:
 def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
     """Stack the arrays of cameras on a new first axis. The array of a single camera is not copied.
 
-    each: array with the shape and dtype of a camera's, for the empty result if there are no cameras.
+    each: array with the shape and dtype of one camera's array. It gives those of the result if there are no cameras.
     """
     if len(arrays) == 1:
         return arrays[0][None]

@@ -346,7 +346,10 @@ def rasterize(
 
 
 def _backgrounds(given: ArrayLike | None, count: int, channels: int) -> list[Float32 | None]:
-    """Return the background (D,) of each camera, given one for all or one for each. Raises InputError."""
+    """Return the background (D,) of each of `count` cameras. Raises InputError.
+
+    given: one background (D,) for all cameras, or (C, D); None for black.
+    """
     if given is None:
         return [None] * count
     rows = floats("backgrounds", given, (count, channels), (channels,))

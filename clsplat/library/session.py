@@ -54,7 +54,10 @@ class LibrarySession:
         self._idle: list[PassWorkspace] = []
 
     def workspace(self, owner: object) -> PassWorkspace:
-        """Return a workspace for a forward pass. When `owner` is deleted, later passes may use the workspace."""
+        """Return a workspace for a forward pass.
+
+        owner: the object of the pass. When it is deleted, later passes may use the workspace.
+        """
         with self.lock:
             work = self._idle.pop() if self._idle else PassWorkspace(self.device, self.scratch)
         finalize(owner, self._take_back, work).atexit = False

@@ -186,7 +186,7 @@ class _GivenSplats:
 
     @classmethod
     def checked(cls, means2d: ArrayLike, conics: ArrayLike, colors: ArrayLike, opacities: ArrayLike) -> _GivenSplats:
-        """Check the arguments of a call. Raises InputError, which names the argument."""
+        """Check the splats of a call of `rasterize_to_pixels`. Raises InputError, which names the argument."""
         means = floats("means2d", means2d, *_shapes_of(means2d, 2))
         batch = means.shape[:-1]
         shapes = floats("conics", conics, (*batch, 3)).reshape(-1, 3)
@@ -198,11 +198,11 @@ class _GivenSplats:
 
     @property
     def depth(self) -> int:
-        """Number D of values that each splat has for a pixel."""
+        """Number D of a splat's colour channels."""
         return int(self.colors.shape[1])
 
     def rows(self, own: slice) -> _GivenSplats:
-        """Return the splats of one image, which are the rows `own`."""
+        """Return the splats of one image. own: the rows of these splats."""
         arrays = (self.means2d[own], self.conics[own], self.colors[own], self.opacities[own])
         return _GivenSplats((len(arrays[0]),), *arrays)
 
@@ -239,7 +239,10 @@ class _GivenLists:
     def checked(
         cls, isect_offsets: ArrayLike, flatten_ids: ArrayLike, size: tuple[int, int], batch: tuple[int, ...]
     ) -> _GivenLists:
-        """Check the arguments of a call for images of this size and splats of this batch. Raises InputError."""
+        """Check the tile lists of a call of `rasterize_to_pixels`. Raises InputError, which names the argument.
+
+        size: width and height of an image in pixels. batch: leading sizes of the splats' arrays, (..., N) or (M,).
+        """
         tiles = (-(-size[1] // TILE), -(-size[0] // TILE))
         lists = cls(*_lists(isect_offsets, flatten_ids, tiles, prod(batch)))
         if len(batch) > 1 and batch[:-1] != lists.images:
@@ -252,7 +255,10 @@ class _GivenLists:
         return self.offsets.shape[:-2]
 
     def of_image(self, image: int, shown: NDArray[np.bool_]) -> _ImageLists:
-        """Return the lists of the image with this index. shown: (tiles,), False for tiles whose list is to be empty."""
+        """Return the tile lists of the image with this index.
+
+        shown: (tiles,), True for tiles that are drawn. The lists of other tiles become empty.
+        """
         tiles = prod(self.offsets.shape[-2:])
         flat, end = self.offsets.reshape(-1), (image + 1) * tiles
         starts = np.append(flat[end - tiles : end], flat[end] if end < len(flat) else len(self.ids))
@@ -302,7 +308,10 @@ def _pixels(
 def _listed(
     device: Device, work: Workspace, gaussians: ScreenGaussians, lists: _ImageLists, size: tuple[int, int]
 ) -> Listed:
-    """Convert the caller's tile lists to a `Listed`, as `library.pixels.listed_by_depth` returns."""
+    """Upload the caller's tile lists of one image, and number the (tile, Gaussian) pairs by Gaussian.
+
+    size: width and height of the image in pixels.
+    """
     drawn, listed = splats(device, work, gaussians, *size, listed=True), lists.gaussians
     by_gaussian = np.bincount(listed, minlength=gaussians.count)
     slots = np.empty(len(listed), np.uint32)
@@ -316,14 +325,17 @@ def _listed(
 
 
 def _shapes_of(values: ArrayLike, last: int) -> list[tuple[int | str, ...]]:
-    """Return the shape (..., N, last) that `floats` is to check, with as many axes as `values`."""
+    """Return the shape that an array must have: as many axes as `values`, of any size except the last axis.
+
+    last: required size of the last axis. The result is in a list, as arguments of `checks.floats`.
+    """
     return [(*(f"axis {axis}" for axis in range(max(np.ndim(values) - 1, 1))), last)]
 
 
 def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, int], count: int) -> tuple[Int64, Int64]:
-    """Return offsets and ids as int64. Raises InputError if they do not fit `tiles` (down, across) and `count`.
+    """Check the caller's tile lists, and return isect_offsets and flatten_ids as int64. Raises InputError.
 
-    count: number of Gaussians.
+    tiles: numbers of tiles down and across an image. count: number of Gaussians of all images.
     """
     offsets, ids = np.asarray(isect_offsets), np.asarray(flatten_ids)
     if offsets.ndim < 2 or offsets.shape[-2:] != tiles or offsets.dtype.kind not in "iu":
@@ -340,7 +352,10 @@ def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, i
 
 
 def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return masks as an array (images, tiles), True for tiles that are drawn. shape: the shape that they must have."""
+    """Check the argument `masks`, and return it as an array (images, tiles), True for tiles that are drawn.
+
+    shape: the required shape, (..., tile_height, tile_width).
+    """
     tiles = prod(shape[-2:])
     if masks is None:
         return np.ones((prod(shape[:-2]), tiles), np.bool_)
@@ -351,9 +366,11 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """Return the rows of an image's Gaussians: in packed arrays, from the lowest to the highest in its lists.
+    """Return the range of rows that holds an image's Gaussians.
 
-    listed: rows in the image's lists. batch: as in `_GivenSplats`. image: index of the image.
+    listed: the rows in the image's tile lists. In packed arrays, the range spans the lowest to the highest of them.
+    batch: leading sizes of the splats' arrays: (..., N), or (M,) for packed arrays.
+    image: index of the image.
     """
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])

@@ -156,7 +156,10 @@ def _lengths(**given: int) -> list[int]:
 
 
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
-    """Return the shape that `floats` is to check: the leading axes of the array `of`, of any size, and then `row`."""
+    """Return the shape that an array must have: the leading axes of the array `of`, of any size, then the sizes `row`.
+
+    The result is in a list, as arguments of `checks.floats`.
+    """
     more = max(np.ndim(of) - len(row), 0)
     return [(*(f"axis {axis}" for axis in range(more)), *row)]
 
@@ -164,7 +167,7 @@ def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
 def _images(count: tuple[int, ...], image_ids: ArrayLike | None, n_images: int | None) -> tuple[int, NDArray[np.int64]]:
     """Return the number of images, and the image of each Gaussian. Raises InputError.
 
-    count: leading sizes of the arrays: (..., N), or (M,) for packed arrays.
+    count: leading sizes of the arrays: (..., N), or (M,) for packed arrays. There image_ids and n_images are required.
     """
     if image_ids is None:
         images = prod(count[:-1])

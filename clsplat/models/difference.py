@@ -58,7 +58,10 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
 
 
 def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """Largest error (n,) of the scales of each Gaussian, relative to its largest scale. a, b: log scales (n, 3)."""
+    """Return for each Gaussian (n,) the largest error of its three scales, divided by its largest scale.
+
+    a, b: log scales (n, 3) of the two models. The largest scale is that of `a`.
+    """
     largest = a.max(axis=1, keepdims=True).astype(np.float64)
     with np.errstate(over="ignore"):
         p, q = np.exp(a - largest), np.exp(b - largest)

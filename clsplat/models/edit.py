@@ -52,7 +52,7 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
     """Mask (n,), True for Gaussians whose opacity is at least `least`."""
     if least >= 1:
         return np.zeros(len(gaussians), np.bool_)
-    with np.errstate(divide="ignore"):  # log(0) = -inf selects every Gaussian
+    with np.errstate(divide="ignore"):  # if `least` is 0, its logit is -inf: all are selected
         return np.asarray(gaussians.opacity_logits >= np.log(least) - np.log1p(-least))
 
 
@@ -154,7 +154,8 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
 def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> Gaussians:
     """Transform a model by a similarity (4, 4) of the world. A pure translation keeps rotations and SH bit for bit.
 
-    slack: largest allowed difference from a similarity, as for `decompose`, whose InputError is raised beyond it.
+    slack: largest allowed difference of Q^T Q from the identity, where Q is the matrix's rotation.
+    Raises InputError if the matrix is not a similarity, like `decompose`.
     """
     scale, turn, shift = decompose(matrix, slack)
     upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # no rotation, up to float64 rounding

@@ -74,7 +74,7 @@ def model_info(path: Path) -> dict[str, Any]:
     result |= {"loses": form.loses} | form.describe(path)
     result |= _summary(blocks, path)
     result["colorspace"] = form.space(path)
-    result["loses"] = result.pop("loses")  # moves the key to the end
+    result["loses"] = result.pop("loses")  # moves "loses" to the end
     return result
 
 

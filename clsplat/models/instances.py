@@ -76,12 +76,15 @@ class Track(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Changing:
-    """`Track` of a `ModelSeries`: places the series' Gaussians of a frame as the track `inner` says for that frame."""
+    """`Track` of a `ModelSeries`. At each frame it places the Gaussians that the series has at that frame.
+
+    inner: the track that gives the transform, opacity and colour at each frame.
+    """
 
     inner: Track
 
     def at(self, frame: float) -> Placement:
-        """Placement of the inner track, with `frame` as the frame of the series."""
+        """Placement of the inner track at a frame, with this frame as the placement's `frame` too."""
         return replace(self.inner.at(frame), frame=float(frame))
 
     @property
@@ -96,7 +99,10 @@ def rows_of(matrix: Float64) -> tuple[float, ...]:
 
 
 def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
-    """`Placement.colour` for gain (3,), offset (3,), then saturation, as in ASC CDL. Empty for the identity."""
+    """Return `Placement.colour` for a gain (3,), then an offset (3,), then a saturation, as in ASC CDL.
+
+    The result is empty if they change no colour.
+    """
     if (gain == 1).all() and (offset == 0).all() and saturation == 1:
         return ()
     spread = saturation * np.eye(3) + (1 - saturation) * np.array(REC709_LUMA_WEIGHTS)
@@ -159,7 +165,10 @@ def _step(now: Placement, before: Placement) -> Float64:
 
 
 def kind_of(model: Gaussians | ModelSeries) -> Gaussians:
-    """The model itself; for a `ModelSeries`, an empty model that is drawn alike and has the same near plane."""
+    """Return a model that tells how the given one is drawn: its `antialiased`, `by_rays` and near plane.
+
+    It is the model itself, or for a `ModelSeries` an empty model.
+    """
     return model.kind if isinstance(model, ModelSeries) else model
 
 

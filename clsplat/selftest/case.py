@@ -59,10 +59,10 @@ class Expected:
     exact: bool = False
 
     def error_of(self, got: Array) -> float:
-        """Return the error of the device's values `got`, which is compared with `bound`.
+        """Return the error of the device's values `got`. The caller compares the error with `bound`.
 
-        It is the largest error after division by the magnitudes, or without them the relative error in the 2-norm. If
-        `exact`, it is the number of wrong elements.
+        The error is the largest one after division by the magnitudes, or without them the relative error in the
+        2-norm. If `exact` is True, it is the number of wrong elements.
         """
         if got.shape != self.values.shape:
             return float("inf")
@@ -128,7 +128,7 @@ class Case:
         return {name: Deviation(each.error_of(got[name]), each.bound) for name, each in self.twin(given, got).items()}
 
     def outcome(self, bench: CaseBench) -> StageOutcome:
-        """Run this case as a stage of the self-test, on the bench's frozen scene."""
+        """Run this case as a stage of the self-test, on the frozen scene of `bench`, and return the outcome."""
         assert self.frozen is not None
         return joined([self._outcome(bench, given) for given in self.frozen(bench)])
 
@@ -153,10 +153,10 @@ class Case:
 
 
 def read_of(**arrays: DeviceArray) -> Read:
-    """Return a function that reads these arrays from the device."""
+    """Return a function that reads these arrays from the device, by name."""
     return lambda: {name: array.get() for name, array in arrays.items()}
 
 
 def fresh_readback(device: Device) -> DeviceArray:
-    """Upload a READBACK array of zeros, which says that no step has stopped."""
+    """Upload zeros for all READBACK columns, which mean that no step has stopped and that Adam has refused nothing."""
     return upload(device, np.zeros(len(READBACK), np.uint32))

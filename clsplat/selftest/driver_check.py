@@ -194,9 +194,12 @@ def examine_device(index: int) -> DriverReport:
 
 
 def _still(index: int, entry: driver_records.Entry, report: DriverReport) -> str:
-    """The reason why a recorded failure is kept after a self-test that passed, or an empty string if it is cleared."""
+    """Return why a recorded failure is kept although the self-test passed, or an empty string if it is cleared.
+
+    entry: the record of the failure. report: the result of the self-test on the device number `index`.
+    """
     name, build = entry.trial.get("name"), entry.trial.get("build")
-    if not entry.trial or name in report.kernels:  # this test has covered the failure
+    if not entry.trial or name in report.kernels:  # the self-test has launched the kernel that had failed
         return ""
     if build is None:
         return f"{entry.failed}; this test does not use that kernel"

@@ -52,9 +52,10 @@ class StageOutcome:
     otherwise: tuple[str, ...] = ()
 
     def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> StageOutcome:
-        """Copy of this outcome with the errors of the stage's results, by the results' names.
+        """Return a copy of this outcome that has the errors of the stage's results.
 
-        parts: the device's and the wanted values of float results; wrong: numbers of wrong elements of integer results.
+        parts: for each float result, by name, the device's values and the wanted values.
+        wrong: for each integer result, by name, the number of wrong elements.
         """
         errors = {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
         counts = ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in wrong.items() if count)
@@ -73,7 +74,9 @@ def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
 
 
 def error_of(got: Array, wanted: Array) -> tuple[float, float]:
-    """The largest absolute error of `got`, and its largest error in ulp; infinite if a value is not finite.
+    """Return the largest absolute error of the values `got`, and their largest error in ulp.
+
+    Both are infinite if a value is not finite.
 
     The ulp is that of the wanted value or of the array's root mean square, whichever is larger, because a sum that
     cancels has no accurate digits.
@@ -143,7 +146,8 @@ class CaseBench:
 
         The first run includes the kernel builds. It is a fault if the bits of the two runs differ.
 
-        launch: runs the stage on the device; take: reads the arrays of the digest from the stage's result.
+        launch: function that runs the stage on the device.
+        take: function that reads the arrays of the digest from the stage's result.
         """
         first = take(launch())
         value, ms = self.device.timed(launch)
@@ -163,10 +167,10 @@ class CaseBench:
         return shown
 
     def splats(self) -> reference_project.ProjectedTwin:
-        """The device's splats, converted to the float64 reference's form."""
+        """Return the device's splats as the float64 reference stores projected Gaussians."""
         visible = self.visible
         raw = self.projected.splats.get()
-        raw[~visible] = 1.0  # replaces uninitialised memory
+        raw[~visible] = 1.0  # invisible Gaussians' splats are uninitialised memory
         splats = raw.astype(np.float64)
         field = {name: splats[:, index] for index, name in enumerate(SPLAT)}
         means = np.stack([field["PIXEL_X"] + field["SUB_X"], field["PIXEL_Y"] + field["SUB_Y"]], axis=1)

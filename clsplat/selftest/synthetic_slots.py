@@ -46,14 +46,14 @@ class MadeUpSlots:
         return cls(Slots(upload(bench.device, values), bench.counted.first_slots), slot_sums(bench, values))
 
     def d_means(self, bench: CaseBench) -> Float64:
-        """Gradients (n, 2) with respect to image positions, per pixel: equation (50) of docs/gradients.md."""
+        """Return gradients (n, 2) per pixel with respect to the means on the image, by (50) of docs/gradients.md."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         _, u, v, *_ = self.sums[:, SLOT_MOMENTS].T
         found: Float64 = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITENING_FACTOR**2
         return found
 
     def on_image(self, bench: CaseBench) -> reference_project.ProjectedGradients:
-        """Gradients with respect to the scene's projected Gaussians, in the form of the float64 reference."""
+        """Return gradients with respect to the scene's projected Gaussians, as the float64 reference stores them."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         *_, uu, uv, vv = self.sums[:, SLOT_MOMENTS].T
         entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]

@@ -64,8 +64,8 @@ def stored_digests() -> dict[str, str | dict[str, str]]:
 def shape_label(device: Device) -> str:
     """The label of the device's kernel shape in digests.json.
 
-    Its number of items is the number of work-items that share a tile. It leaves out whether work-items sum within
-    sub-groups.
+    In this label, the number of items is the number of work-items that share a tile. The label does not tell whether
+    work-items sum within sub-groups.
     """
     return replace(device.shape, items=tile_items(device), subgroups=False).label
 

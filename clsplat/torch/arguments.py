@@ -29,7 +29,7 @@ def refuse(name: str, found: object, expected: str) -> InputError:
 
 @contextmanager
 def renamed(**names: str) -> Iterator[None]:
-    """Context in which error messages use gsplat's argument names. names: gsplat's names, by clsplat's own."""
+    """Context manager: put gsplat's argument names into error messages. names: gsplat's names, by clsplat's names."""
     try:
         yield
     except InputError as error:
@@ -51,7 +51,7 @@ def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 
 def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Check a tensor like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
+    """Raise InputError like `check_shape`, but accept tensors of torch.func, which pure PyTorch can read."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -63,7 +63,10 @@ def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Raise InputError like `check_shape`, and for NaN. Tensors of torch.func are accepted."""
+    """Raise InputError unless the argument is a dense tensor of real numbers with one of `shapes` and without NaN.
+
+    A string in a shape stands for any size. Tensors of torch.func are accepted.
+    """
     _check_shape(name, value, *shapes)
     # the sum is NaN if a value is, and needs no additional array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):

@@ -29,7 +29,10 @@ RASTERIZATION_INPUTS = ("means", "quaternions", "scales", "covars", "opacities",
 
 
 class Batches:
-    """A tensor as a sequence of arrays, one for each batch. Each is None if the tensor is None."""
+    """A tensor as a sequence of arrays, one for each batch; a sequence of None if the tensor is None.
+
+    batch: sizes of the tensor's leading axes, which are the batches.
+    """
 
     def __init__(self, value: Tensor | None, batch: tuple[int, ...]) -> None:
         array = None if value is None else as_array(value)
@@ -71,13 +74,16 @@ class BatchResults:
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The arrays named in PROJECTED_SPLAT_NAMES, in the layout of `meta`, with the device and dtype of `like`."""
+        """The splats' means2d, conics, depths and opacities, with the device and dtype of `like`.
+
+        Shapes are (..., C, N, ...), or (nnz, ...) with a row for each splat in view if packed.
+        """
         arrays = (self.laid_out(self.stacked(name)) for name in PROJECTED_SPLAT_NAMES)
         means2d, conics, depths, opacities = (as_tensor(array, like) for array in arrays)
         return means2d, conics, depths, opacities
 
     def radii(self) -> NDArray[np.int32]:
-        """A copy of the radii in the layout of `meta`, because the gradient reads the library's own array later."""
+        """A copy of the radii (..., C, N, 2), or (nnz, 2) if packed; the gradient reads the original array later."""
         radii = self.laid_out(self.stacked("radii"))
         return radii if self.packed else radii.copy()
 
@@ -107,7 +113,7 @@ class BatchResults:
         return as_tensor(self.by_camera("images"), like), as_tensor(self.by_camera("alphas"), like)
 
     def of_rows(self, gradient: Tensor) -> Tensor:
-        """A gradient (N, ...) as a COO tensor of the rows in view, without duplicate rows."""
+        """Convert a gradient (N, ...) to a COO tensor that has only the rows of Gaussians in view."""
         assert self.in_view is not None
         rows = torch.from_numpy(np.unique(self.in_view % self.sizes[2])).to(gradient.device)
         return torch.sparse_coo_tensor(
@@ -121,7 +127,7 @@ class BatchResults:
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
     def whole(self, name: str, value: Tensor | None) -> Any:
-        """Convert a gradient from the layout of `meta` to (B, C, N, ...).
+        """Convert the gradient `value` with respect to the array `name` from the layout of `meta` to (B, C, N, ...).
 
         If `in_layout` made the tensor, and PyTorch's version counter shows no change, this returns the array from which
         the tensor was made.
@@ -143,9 +149,10 @@ class BatchResults:
         return rows.reshape(*self.sizes, *array.shape[1:])
 
     def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
-        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch lacks it.
+        """Return the gradient with respect to the argument `like`, with its shape and dtype.
 
-        each: gradients by name, for each batch.
+        each: for each batch, the gradients by name. name: the gradient's name.
+        Returns None if `like` is None, or if a batch has no gradient of this name.
         """
         if like is None or any(found.get(name) is None for found in each):
             return None
@@ -156,8 +163,10 @@ class BatchResults:
     def gradients(
         self, each: list[dict[str, Any]], inputs: dict[str, Tensor | None], needed: Sequence[bool]
     ) -> list[Tensor | None]:
-        """Gradients with respect to the arguments that need one, None for the others. If the call is sparse, gradients
-        with respect to SPARSE_GRADIENT_ARGUMENTS have only the rows in view.
+        """Return the gradient with respect to each of the `inputs`; None for an input whose gradient is not needed.
+
+        each: for each batch, the gradients by name. needed: for each input, True if its gradient is needed.
+        If the call is sparse, gradients with respect to SPARSE_GRADIENT_ARGUMENTS have only the rows in view.
         """
         found = [
             self.gradient(each, name, like) if wanted else None
@@ -172,8 +181,9 @@ class BatchResults:
         ]
 
     def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor, *, hand_on: bool) -> Tensor:
-        """The gradient with respect to an array of splats, from all batches, in the layout of `meta`.
+        """Return the gradient with respect to an array of splats, from all batches, in the layout of `meta`.
 
+        each: for each batch, the gradients by name. name: the array's name. like: the array as a tensor.
         hand_on: keep the array, so that `whole` can return it. It is not kept if `like` has hooks, as a hook could
         change the tensor without a new version.
         """
@@ -198,11 +208,13 @@ def _is_same(one: Tensor, other: Tensor) -> bool:
 
 
 class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """Projection of Gaussians to splats in the layout of `meta` (see `BatchResults`)."""
+    """Autograd function that projects Gaussians to splats. Splats are (..., C, N, ...), or (nnz, ...) if packed."""
 
     @staticmethod
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        """The arrays named in PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
+        """The splats' means2d, conics, depths and opacities, and their colours (..., C, N, 3) from SH coefficients.
+
+        Without SH coefficients there are no colours.
 
         inputs: the tensors that RASTERIZATION_INPUTS names. covars are upper triangles; colors are None unless they are
         SH coefficients.
@@ -248,7 +260,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
 
 
 class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """Blending of splats in the layout of `meta` (see `BatchResults`) to images and alphas."""
+    """Autograd function that blends splats, (..., C, N, ...) or (nnz, ...) if packed, to images and alphas."""
 
     @staticmethod
     def forward(
@@ -261,7 +273,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
         values: Tensor | None,
         backgrounds: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """Images (..., C, H, W, X) and alphas (..., C, H, W, 1).
+        """Images (..., C, H, W, X) and alphas (..., C, H, W, 1) of the splats.
 
         values: values to blend, (..., N, D) or (..., C, N, D); None if only depth is rendered.
         """
@@ -292,7 +304,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
             means2d.absgrad = call.in_layout(each, "absolute", means2d, hand_on=False)
         if (
             values is not None and values.dim() == len(call.batch) + 2
-        ):  # all cameras share the values, and add their gradients
+        ):  # all cameras share the values: sum their gradients
             each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
         return (
             None,

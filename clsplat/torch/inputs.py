@@ -94,7 +94,11 @@ class GivenTensors:
         return batch
 
     def used(self, *, depth_alone: bool) -> GivenTensors:
-        """The tensors that the result depends on. covars replace quats and scales; depth has no background."""
+        """Return the tensors on which the result depends; the others become None.
+
+        If covars are given, they replace quats and scales. depth_alone: True if no colour is rendered, so that
+        backgrounds have no effect.
+        """
         given = self if self.covars is None else replace(self, quats=None, scales=None)
         return replace(given, backgrounds=None) if depth_alone else given
 

@@ -245,7 +245,7 @@ def rasterization(
 def _with_gradient(
     call: BatchResults, given: GivenTensors, sh_degree: int | None, *, depth_alone: bool
 ) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The arrays named in PROJECTED_SPLAT_NAMES, the images and the alphas, as differentiable tensors."""
+    """The splats' means2d, conics, depths and opacities, the images and the alphas, as differentiable tensors."""
     covars, colors = given.covars, given.colors
     if covars is not None:
         covars = (
@@ -295,7 +295,7 @@ def _meta(
     """The dictionary `meta` of `rasterization`, with gsplat's entries in gsplat's order.
 
     like: a tensor from which the entries take device and dtype.
-    splats: the arrays named in PROJECTED_SPLAT_NAMES; None computes them on first access, without gradient.
+    splats: means2d, conics, depths and opacities; None computes them on first access, without gradient.
     """
     batches, cameras, _ = call.sizes
     like = like.new_empty(0)  # empty, so that the dictionary does not keep the caller's tensor alive

@@ -77,13 +77,13 @@ def test_plots_are_written(tmp_path: Path, result: dict[str, object], name: str)
     ]
     assert names == ["no early-stop", "tile-test square"]  # the axis runs upwards: what is worth most is on top
     assert {"1.05", "1.50", "a frame", "a training step", "a title"} <= set(switches)
-    assert "With all off: 4.25 for a frame, 4.13 for a step." in switches
+    assert "With all switches off: 4.25 for a frame, 4.13 for a step." in switches
     assert {"fast (0.02)", "fast again (0.021)", "slow (0.03)", "exact: 40.0 ms", "a title"} <= set(error)
     notes = " ".join(error)
     for words in (
         "Error against the exact preset's frame",
         "3x4 pixels in the middle: 120.0 dB, largest error 1e-06",
-        "the same bits as exact here: in vain (41.0 ms)",
+        "the same bits as the exact preset's: in vain (41.0 ms)",
     ):
         assert words in notes
     assert not any("early-stop" in word for word in error)

@@ -106,8 +106,8 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # subtracted, since float32 is coarse far from 0
-    centred = vectors - middle
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
+    centred = vectors - middle  # because float32 is coarse far from 0
     sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
     centres = sample[order[((np.arange(size) + 0.5) / size * len(order)).astype(np.int64)]]

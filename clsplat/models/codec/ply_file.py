@@ -110,7 +110,7 @@ class PlyHeader:
 
     @property
     def before(self) -> list[Element]:
-        """Elements stored before the vertices."""
+        """The elements that the file stores before its vertices."""
         return self.elements[: self.elements.index(self.vertex)]
 
     def start(self, index: int) -> int:
@@ -149,7 +149,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     for line in _header_lines(file, path):
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            given = numbers(words[3:])  # empty in comments of other kinds, which have words here
+            given = numbers(words[3:])  # empty unless the words are numbers
             if words[:3] == ORIGIN_COMMENT:
                 origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE_COMMENT:

@@ -86,7 +86,8 @@ def without_rotation(gaussians: Gaussians) -> NDArray[np.bool_]:
 def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
     """Repair or leave out Gaussians with invalid values (see the module). Works in place unless some are left out.
 
-    activated: what the file stores as opacities or scales, and is converted to logits or logs; None for nothing.
+    activated: the values that the file stores as opacities or scales; they are converted to logits or logs of scales.
+        None means that the file stores logits and logs.
     where: prefix of messages.
     Warns once for each kind of repair, with the Gaussians' indices in the file. Raises InputError if no Gaussian is
     left.
@@ -195,9 +196,9 @@ def _seen_scales(log_scales: Float32) -> str:
 
 
 def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.intp], where: Path | str) -> Gaussians:
-    """Convert opacities (fractions, percentages or levels) to logits, and scales to logs. which: what to convert.
+    """Convert opacities (fractions, percentages or levels) to logits, or scales to logs, or both.
 
-    numbers: index of each Gaussian in the file.
+    which: the values to convert. numbers: index of each Gaussian in the file, for messages.
     Raises InputError, prefixed with `where`, for values that cannot be opacities or scales, and for whole numbers that
     may be percentages or levels.
     """

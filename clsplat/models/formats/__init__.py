@@ -152,10 +152,10 @@ def format_of(path: Path) -> Format:
         return named
     with open_input(path, f"a model file with one of the suffixes {' '.join(suffixes())}") as file:
         head = file.read(FORMAT_HEAD_BYTES)
-        if head.startswith(b"ply") and b"end_header" not in head:  # a PLY's comments may fill the head
+        if head.startswith(b"ply") and b"end_header" not in head:  # long comments: read to the header's end
             head += file.read(MAX_PLY_HEADER_BYTES)
-    # If the name is of a format without a signature, it counts unless the file begins with another format's signature.
-    # A "{", with which JSON begins, does not show another format: it may be the file's first byte by chance.
+    # A format without a signature is recognised by the file's name, unless the file begins with another's signature.
+    # The "{" with which JSON begins is no such signature: the first byte of any file may be a "{" by chance.
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
     if head.startswith(zipped.ZIP_FILE_MAGIC) and (not fits or named is _row("SOG")):
         return _archive(path, named)
@@ -189,9 +189,9 @@ def _has_mark(path: Path, head: bytes) -> bool:
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
-    """Context manager that yields a model's file and format.
+    """Context manager that yields a model's file and its format.
 
-    It unpacks a zipped model, and removes the unpacked file afterwards. Raises InputError like `resolve` and
+    A zipped model is unpacked, and the unpacked file is removed at the end. Raises InputError like `resolve` and
     `zipped.unpacked`.
     """
     file, row = path, format_of(path)
@@ -200,7 +200,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
 
 
 def resolve(path: Path) -> tuple[Path, Format]:
-    """Model file and format at a path, which may be the folder of a model.
+    """Return the path of the model file and its format. path: the file, or the folder of a model.
 
     Raises InputError like `format_of`. Warns if the file's name has the suffix of another format.
     """
@@ -225,8 +225,9 @@ def model_path(path: Path) -> Path:
 def load(path: str | os.PathLike[str], *, activated: Activated | None = None, check_encoding: bool = True) -> Gaussians:
     """Read a model file of any format, and repair its values (`repair.repaired`).
 
-    activated: what the file stores as opacities or scales, and is converted to logits or logs; None for nothing.
-    check_encoding: warn if the values look as if `activated` were needed.
+    activated: the values that the file stores as opacities or scales; they are converted to logits or logs of scales.
+        None means that the file stores logits and logs.
+    check_encoding: warn if the values look like opacities or scales, although they are read as logits or logs.
     Raises InputError.
     """
     path, row = resolve(Path(path))

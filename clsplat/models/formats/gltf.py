@@ -89,7 +89,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # as a list, all are counted before the first is read
+    primitives = list(asset.primitives())  # a list: if there are too many, none is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -112,7 +112,8 @@ def _writer_of_logs(asset: Asset) -> str:
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[tuple[str, Gaussians]]) -> Gaussians:
     """Read the Gaussians of a primitive, in clsplat's axes.
 
-    scaled: list to which Gaussians whose `log_scales` still holds linear scales are added, with a prefix for messages.
+    If their scales are linear, `log_scales` holds them unchanged, and the Gaussians are appended to the list `scaled`
+    together with a prefix for messages. The caller then takes the logs.
     """
     said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", GLTF_COLOR_SPACES[0])
@@ -205,7 +206,7 @@ def write(
 
 
 def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
-    """Functions that return each attribute's values in glTF's axes, by the attribute's name, in the buffer's order."""
+    """Return a function for each attribute, by name and in the buffer's order: it returns values in glTF's axes."""
 
     def rotation(rows: slice) -> Array:
         unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LUF_SIGNS)
@@ -235,7 +236,7 @@ def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
 
 
 def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
-    """Yield the bytes of all attributes, one attribute after another."""
+    """Yield the bytes of all attributes, one attribute after another. count: number of Gaussians."""
     for rows_of in attributes:
         for rows in values.row_blocks(count):
             block = rows_of(rows)
@@ -252,7 +253,7 @@ class GaussianNode(TypedDict):
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """Build the glTF file's JSON object, still without the key `buffers`, and the contents of its only buffer."""
+    """Build the JSON object of a glTF file, except the key `buffers`, and the contents of the file's only buffer."""
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}

@@ -49,7 +49,7 @@ BUCKET_CENTRE_BYTES = 12
 DEFAULT_POSITION_RANGE = 32767
 """Largest distance, in steps, of a stored position from its bucket's centre. A header with a 0 means this default."""
 DEFAULT_SH_BOUND = 1.5
-"""Magnitude of the least and largest SH coefficient. A header with a 0 means this default."""
+"""Bound b of SH coefficients, which bytes store between -b and b. A header with a 0 means this default."""
 SH_VALUES_BY_DEGREE = (0, 9, 24, 45)
 _POSITION_DTYPES, _FLOAT_DTYPES, _SH_DTYPES = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
 
@@ -61,7 +61,8 @@ class Section:
     count: number of Gaussians.
     start: byte offset of the first Gaussian.
     kind: dtype of a record.
-    step, middle: world units per step of a stored position, and the number of steps stored for a bucket's centre.
+    step: world units per step of a stored position.
+    middle: the stored number, in steps, that stands for the bucket's centre.
     centres: (buckets, 3), the buckets' centres in world units; None at level 0.
     ends: (buckets,), index of the first Gaussian after each bucket; None at level 0.
     """

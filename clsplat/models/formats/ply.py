@@ -271,7 +271,8 @@ def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
 def _subtract_origin(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
     """Make the means relative to `origin`, in place.
 
-    local: exact means (n, 3), used for all vertices that no other tool has moved since; None if the file has none.
+    local: exact means (n, 3) of the file; None if it has none. They are used for all vertices whose world coordinates
+    still agree with them. Other tools may have moved the rest.
     """
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -319,7 +320,7 @@ def _degree(rest: int) -> int:
 
 
 def _colour_names(vertex: Element) -> tuple[str, ...]:
-    """Names of the colour properties: f_dc, or those of RGB_PROPERTY_NAMES if the file has them and no f_dc."""
+    """Names of the colour properties: f_dc, or names in RGB_PROPERTY_NAMES if the file has these instead of f_dc."""
     names = [name for name, _ in vertex.properties]
     return _rgb_names(names) or DC_PROPERTIES if set(DC_PROPERTIES).isdisjoint(names) else DC_PROPERTIES
 
@@ -331,7 +332,10 @@ def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _convert_colours(gaussians: Gaussians, vertex: Element) -> None:
-    """Convert `gaussians.sh` to SH coefficients if it holds colours, because the file has them instead of f_dc."""
+    """Convert the colours in `gaussians.sh` to SH coefficients if the file has RGB colours instead of f_dc.
+
+    vertex: the file's element of vertices.
+    """
     if (names := _colour_names(vertex)) != DC_PROPERTIES:
         kinds = {np.dtype(kind) for name, kind in vertex.properties if name in names}
         whole = all(kind.kind in "iu" for kind in kinds)
@@ -358,7 +362,10 @@ def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
 
 
 def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
-    """Copy a block into a model with the same number of Gaussians. Doubles beyond float32 become infinite."""
+    """Copy a block of a PLY's rows into `gaussians`, which has a row for each. Doubles beyond float32 become infinite.
+
+    rest: number of f_rest properties.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         for name, column in _columns(gaussians, rest).items():
             if name in block:
@@ -370,7 +377,7 @@ def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int) -> Gaussians:
-    """Copy the blocks into one model of `count` Gaussians."""
+    """Copy blocks of a PLY's rows into one model of `count` Gaussians. rest: number of f_rest properties."""
     first = next(blocks)  # reading the first block checks that the file has `count` rows
     result = values.empty(count, _degree(rest))
     start = 0

@@ -56,7 +56,7 @@ MAX_PALETTE_ENTRIES = 1 << 16
 PALETTE_COLUMNS = 64
 QUATERNION_TAG_BASE = 252
 MAX_UNCHECKED_IMAGE_BYTES = 16 << 20
-"""Number of bytes that an image in an archive may have, in addition to 8 bytes (two raw pixels) for each Gaussian."""
+"""Largest size in bytes of an image in an archive, not counting 8 bytes (two raw pixels) for each Gaussian."""
 
 
 def recognises(head: bytes) -> bool:
@@ -165,9 +165,10 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
 def _unpacked(
     path: Path, archive: zipfile.ZipFile, members: dict[str, str], target: Path, name: str, limit: int
 ) -> Path:
-    """Unpack the file `name` of a .sog archive to `target`, and return `target`. members: result of `_members`.
+    """Unpack the file `name` of a .sog archive to `target`, and return `target`.
 
-    Raises InputError if the archive lacks the file, or if it has more than `limit` bytes.
+    members: names of the archive's files, by their paths relative to the folder of meta.json.
+    Raises InputError if the archive lacks the file, or if the file has more than `limit` bytes.
     """
     stored = _match_case(name, members)
     try:
@@ -179,7 +180,7 @@ def _unpacked(
                     raise InputError(f"{path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
                 try:
                     file.write(block)
-                    file.flush()  # else close would raise write errors, as if reading had failed
+                    file.flush()  # a full disk raises its error here, and not in close
                 except OSError as error:
                     raise write_error(target, error) from None
     except KeyError:
@@ -337,9 +338,9 @@ class _Meta:
         said = self.section("shN").get("bands") if self.version == 2 else None
         bands = next((degree for degree in range(1, MAX_SH_DEGREE + 1) if degree * (degree + 2) == width), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
-            found = f"{table.shape[1]} pixels wide for {'unstated' if said is None else str(said)[:20]} bands"
+            found = f"{table.shape[1]} pixels wide{'' if said is None else f' for {str(said)[:20]} SH bands'}"
             widths = ", ".join(f"{PALETTE_COLUMNS * d * (d + 2)} for {d}" for d in range(1, MAX_SH_DEGREE + 1))
-            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths} bands")
+            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths} SH bands")
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has the index {needed - 1}, but its palette has {len(colours)} entries")
@@ -350,7 +351,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - QUATERNION_TAG_BASE
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     result = packing.restore_largest(np.maximum(tag, 0), three)
-    result[tag < 0] = (1, 0, 0, 0)  # without a valid index: the identity rotation, as in splat-transform
+    result[tag < 0] = (1, 0, 0, 0)  # an invalid index: as splat-transform, use no rotation
     return result
 
 

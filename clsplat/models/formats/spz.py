@@ -205,7 +205,7 @@ def _axis_signs(extensions: bytes, path: Path) -> Signs:
 
 @dataclass
 class _Slice:
-    """Stream of the next `left` bytes of a file."""
+    """Stream that ends after the next `left` bytes of a file."""
 
     file: BinaryIO
     left: int
@@ -336,7 +336,7 @@ def write(
     """Write an SPZ file, atomically; equal Gaussians give equal bytes.
 
     fractional_bits: number of fractional bits of positions; None lets `header_for` choose it.
-    sh_bits: bits of band 1 and of the higher bands, 1 to 8.
+    sh_bits: numbers of bits, 1 to 8, to which SH coefficients are rounded: in band 1, and in the higher bands.
     Means are relative to the world's origin, and lose precision far from it. Raises InputError for non-finite values,
     and for positions that are too large. Raises ValueError for settings out of range.
     """
@@ -349,7 +349,7 @@ def write(
 
 
 def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> SpzHeader:
-    """Header for `write_to`. The model must have at least one Gaussian.
+    """Return the header with which `write_to` writes a model of at least one Gaussian. path: for messages.
 
     fractional_bits: None chooses 12, as Niantic's library does, but fewer if the positions would not fit, and more for
       a small model. The model's size is measured without its farthest 1 % of Gaussians.
@@ -381,7 +381,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
 def write_to(
     file: BinaryIO, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int] = DEFAULT_SH_BITS
 ) -> None:
-    """Write an SPZ file at the current position of a seekable file. header: from `header_for`."""
+    """Write an SPZ file at the current position of a seekable file. header: as `header_for` returns it."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:

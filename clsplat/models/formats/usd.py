@@ -154,7 +154,7 @@ def _open(path: Path) -> Any:
     stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
-        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # for a layer in a .usdz: the archive itself
         if file and not Path(os.path.realpath(file)).is_relative_to(folder):
             raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
     del diagnostics
@@ -232,9 +232,9 @@ def _coefficients(prim: Any) -> Any:
 
 
 def _space(attribute: Any, usual: str) -> str:
-    """clsplat's name for an attribute's colour space, which the attribute, its prim or an ancestor states.
+    """Return clsplat's name for an attribute's colour space, which the attribute, its prim or an ancestor states.
 
-    usual: result if none of them states one.
+    usual: the result if none of these states a colour space.
     """
     name, prim = str(attribute.GetColorSpace() if attribute.HasColorSpace() else ""), attribute.GetPrim()
     while not name and prim and not prim.IsPseudoRoot():
@@ -245,9 +245,10 @@ def _space(attribute: Any, usual: str) -> str:
 
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
-    """Values (count, width) of a prim's attribute `name`, or of its half-float variant, whose name ends in h.
+    """Read the values (count, width) of a prim's attribute `name`, or of its half-float variant, whose name ends in h.
 
-    Returns None if neither attribute has a value. count: number of rows that are needed; None for all.
+    where: prefix of errors. count: number of rows to return; None returns all rows.
+    Returns None if neither attribute has a value. Raises InputError for too few rows, or a wrong dtype or shape.
     """
     for key in (name, f"{name}h"):
         attribute = prim.GetAttribute(key)
@@ -326,7 +327,7 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
 
 
 def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
-    """Values (count, width) of a primvar, which has a value for each Gaussian or one for all; None without a value."""
+    """Values (count, width) of a primvar, with a value for each Gaussian or one for all; None if it has none."""
     attribute = prim.GetAttribute(name)
     value = attribute.Get(time) if attribute else None
     if value is None or not len(value):

@@ -99,7 +99,10 @@ class PointInstance:
 
 
 class Instancer:
-    """A PointInstancer with its instances. It may itself be in an instance, `outer`."""
+    """A PointInstancer with its instances.
+
+    outer: the instance of another instancer that contains this instancer; None if there is none.
+    """
 
     def __init__(self, prim: Any, name: str, where: str, outer: PointInstance | None) -> None:
         """Read the prototypes of an instancer.
@@ -129,7 +132,10 @@ class Instancer:
 
     @property
     def reach(self) -> list[float]:
-        """Time samples of the transforms of the instances and the instancer; with velocities also -inf and inf."""
+        """Time samples of the transforms of the instancer and its instances.
+
+        If the instances have velocities, which move them at any time, -inf and inf are added.
+        """
         moved = [time for name in _TRANSFORM_ATTRIBUTES for time in self._samples(name)]
         own = moved + [time for prim in _above(self.prim, self.outer and self.outer.root) for time in _samples_of(prim)]
         return [-math.inf, math.inf, *own] if moved and any(map(self._has, _VELOCITY_ATTRIBUTES)) else own
@@ -150,8 +156,7 @@ class Instancer:
         An instance that does not exist at this time is invisible. It has the matrix of the last time before at which it
         existed, or if there is none, of the first time after. Raises InputError.
 
-        key: the instance.
-        code: USD's time code.
+        key: the instance's key. code: USD's time code.
         """
         places, hidden = self._at(code)
         if key in places:
@@ -335,7 +340,7 @@ def _lost(stage: Any) -> list[str]:
 
 
 def _of_prototypes() -> Any:
-    """USD predicate that selects the prims of a prototype that are drawn, also prims that are only overs."""
+    """USD predicate that selects the prims of a prototype that are drawn. Prims that are only overs are drawn too."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract)
@@ -390,7 +395,10 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """Divide USD's matrix by the scales, and return the nearest rotation, since the quotient may be sheared a bit."""
+    """Return the rotation of USD's matrix of an instance, from which the three scales are removed.
+
+    It is the rotation nearest to the matrix without scales, which may be sheared a bit.
+    """
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]

@@ -41,13 +41,12 @@ ENCRYPTED_FLAG = 1
 
 def recognises(head: bytes) -> bool:
     """True if a file begins like a zip archive."""
-    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # an archive without files begins with the second
+    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second is that of an archive without files
 
 
 @dataclass(frozen=True)
 class ZipReader:
-    """Reads the model in a zip archive. Its functions are passed in, since they use the table of formats, which imports
-    this module.
+    """Reads the model in a zip archive. These functions are passed in, since their module imports this one.
 
     is_model_name(path): True if a file has the name of a model.
     has_gaussians(path, head): True if `head`, the first bytes of a file with a model's name, shows Gaussians.
@@ -116,7 +115,10 @@ def unpacked(path: Path, reader: ZipReader) -> Iterator[Path]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Context manager that opens an archive. Raises InputError if it is damaged or encrypted, also while it is read."""
+    """Context manager that opens an archive.
+
+    Raises InputError if the archive is damaged or encrypted, on opening or when the caller reads from it.
+    """
     with open_input(path, "a .zip archive") as file:
         try:
             with zipfile.ZipFile(file) as archive:
@@ -133,7 +135,10 @@ def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
 
 
 def _possible_models(archive: zipfile.ZipFile, reader: ZipReader) -> list[zipfile.ZipInfo]:
-    """Files with a model's name. If there are several, only those whose first bytes show Gaussians, if any do."""
+    """Return the files that may be the model: all files with the name of a model format.
+
+    If there are several, files whose first bytes show no Gaussians are left out, unless no file shows any.
+    """
     models = []
     for member in archive.infolist():
         parts = _parts(member)
@@ -171,7 +176,7 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> 
         while block := source.read(1 << 20):  # zipfile stops at the size that the archive states
             try:
                 file.write(block)
-                file.flush()  # else close would raise write errors, as if reading had failed
+                file.flush()  # a full disk raises its error here, and not in close
             except OSError as error:
                 raise write_error(target, error) from None
 

@@ -33,7 +33,8 @@ from clsplat.stages.appearance import (
 MIX_RATE_FACTOR = 0.125
 """Learning rate of colour mixes, divided by that of gains."""
 MAX_FALLOFF_OCTAVES, MAX_MIX = 16.0, 0.2
-"""Limits in the kernels: of a vignette in octaves, and of the absolute value of a colour mix."""
+"""Limits in the kernels: the largest change of brightness by a vignette, in octaves, and the largest magnitude of a
+colour mix."""
 
 
 def random_gradient(rng: Generator, image: Float32) -> Float32:
@@ -59,8 +60,8 @@ def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) 
 def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs:
     """Random inputs of a colour model.
 
-    Gains are 1/256 to 256, other entries are within their limits, gradients are of any magnitude, and principal points
-    are inside and outside the picture.
+    Gains are 1/256 to 256, and colour mixes are at most MAX_MIX in magnitude. Gradients have any magnitude. Principal
+    points are inside and outside the picture.
     """
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
@@ -85,7 +86,8 @@ def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs
 def _frozen(model: ColourModel, bench: CaseBench) -> list[Inputs]:
     """Inputs with three photographs and two lenses, of which photograph 1 and lens 1 are used.
 
-    In a colour model that has gains alone, two of the photographs are pulled towards `start`.
+    In a colour model that has gains alone, the gradient has a term that pulls the gains of photographs 0 and 1 towards
+    their initial values `start`.
     """
     pulled = model.sums == GAIN_ENTRIES
     pictures, seed, end = ((45, 42), 41, 1.0) if pulled else ((48, 49), 46, 0.125)
@@ -155,14 +157,16 @@ def stepped(values: Float64, rate: float | Float64) -> Expected:
 
 
 def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
-    """The expected photograph after gains, other entries and the vignette are removed. squared: squared distances of
-    the pixels from the principal point."""
+    """Expect the photograph from which the colour model has removed gains, colour mixes and vignette.
+
+    squared: (H, W), squared distances of the pixels from the principal point.
+    """
     twin = import_module(f"clsplat.reference.{model.stem}")
     photograph, entries, lenses = given.wide("photograph", "entries", "lenses")
     own, lens = entries[given.taken.photograph], lenses[given.taken.lens]
     wanted = twin.developed(photograph, own, lens, squared)
     if model.sums == GAIN_ENTRIES:
-        return Expected(wanted, 3e-7, wanted)  # the bound covers the roundings of 2^log and of a quotient
+        return Expected(wanted, 3e-7, wanted)  # the bound covers the roundings of a gain and of a quotient
     white, none = np.ones_like(photograph), np.zeros_like(own)
     octaves, most = (np.log2(twin.developed(white, none, each, squared)) for each in (lens, -np.abs(lens)))
     largest = np.maximum(np.abs(wanted), photograph / np.exp2(own[:GAIN_ENTRIES])).max(axis=2, keepdims=True)

@@ -103,9 +103,9 @@ BOUNDS_CASE = Case(
 
 MOMENTS = ("first", "second")
 CURRENT = ("current_totals", "current_largest")
-"""Names of the statistics of contributions to which every view is added."""
+"""Names of the two statistics of contributions (sum and maximum over views) that the tested view updates."""
 BEGIN = 0.5
-"""Value of the statistics in CURRENT before the view."""
+"""Value of the statistics in CURRENT before the tested view updates them."""
 STEP = 7
 """Number of the tested step of Adam. The first step of a training has number 1."""
 AREA = 2.0
@@ -162,7 +162,7 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
 
 
 def _rows(given: Inputs) -> NDArray[np.int64]:
-    """Indices of the model's rows in the chunks that take part in the step, in ascending order."""
+    """Return the model's rows, in ascending order, that are in the chunks which take part in the step."""
     rows = np.arange(len(given.gaussians))
     return rows[np.isin(rows // CHUNK_ROWS, given.numbers)]
 
@@ -226,9 +226,9 @@ def _flat(model: DeviceGaussians) -> Array:
 
 
 def _twin_of_step(given: Inputs, got: Arrays) -> dict[str, Expected]:
-    """Expected values of the rows in the step's chunks: the twin's, after a step over the whole model.
+    """Expect in the step's chunks the values that the twin computes by a step over the whole model.
 
-    The twin gets the projection and its gradient from the device, because other stages test these.
+    The twin gets the projection and its gradient from the device, because other stages test them.
     """
     rows, counts = _rows(given), got.pop("whole counts")
     listed = np.isin(np.arange(len(counts)), rows)
@@ -278,9 +278,10 @@ STATE = ("parameters", "first", "second")
 
 
 def _random_missed(rng: Generator, count: int) -> Inputs:
-    """Random inputs of catch-up: moments of any magnitude, some of them zero, of which only some chunks are caught up.
+    """Random inputs of catch-up: a model of which some chunks take the steps of Adam that they missed.
 
-    last: for each chunk to catch up, by its number, the number of the last step that it has taken.
+    The moments have any magnitude, and some are zero.
+    last: the last step that a chunk has taken, by the chunk's number. Only the chunks in `last` are caught up.
     first_step: number of the first step in `rates`. No chunk missed an earlier step.
     rates: learning rates by the step's number and by parameter group.
     every: number of steps between updates of the SH bands from degree 1 on.
@@ -373,10 +374,10 @@ MADE_WORDS = 4999
 
 
 def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficients: int) -> Inputs:
-    """Inputs of copies between a pool of chunks and records: the contents of the pool, and records for some slots.
+    """Make a pool of chunks and records, as inputs of copies from the pool to records and from records to the pool.
 
-    slots: numbers of the slots that are copied.
-    words: 32-bit words that fill the pool; in reverse order they fill the records.
+    slots: numbers of the pool's slots that are copied.
+    words: 32-bit words, repeated to fill the pool, and in reverse order to fill the records.
     coefficients: number of SH coefficients of a Gaussian.
     """
     fields: dict[str, tuple[int, ...]] = {"logit": (), "mean": (3,), "rest": (coefficients - 1, 3)}

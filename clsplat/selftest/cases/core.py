@@ -98,8 +98,10 @@ def _project(bench: CaseBench) -> StageOutcome:
 
 
 def _box_tiles(projected: reference_project.ProjectedTwin, tiles: tuple[int, int]) -> NDArray[np.int64]:
-    """An upper bound of each Gaussian's number of tiles: the tiles of its bounding box, enlarged by half a pixel; 0 for
-    invisible Gaussians."""
+    """Return an upper bound (n,) of the number of tiles that a Gaussian reaches; 0 if it is invisible.
+
+    It counts the tiles of the Gaussian's bounding box, enlarged by half a pixel. tiles: numbers across and down.
+    """
     low = np.floor((projected.means2d - projected.half_extents - 0.5) / TILE)
     high = np.floor((projected.means2d + projected.half_extents + 0.5) / TILE) + 1
     spans = np.clip(high, 0, tiles) - np.clip(low, 0, tiles)
@@ -201,9 +203,10 @@ def _blend_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
-    """Compute the moments (n, 6) of the Gaussians' slots from the twin's gradients.
+    """Compute from the twin's gradients the sums (n, 6) that the slots of each Gaussian must add up to: of g, and the
+    first and second moments of g, by equations (49) and (25) to (29) of docs/gradients.md.
 
-    The equations are (49) and (25) to (29) of docs/gradients.md.
+    wanted: the twin's gradients with respect to the projected Gaussians `splats`.
     """
     l11, l12, l22 = (WHITENING_FACTOR * splats.whitening).T
     gx, gy = -(WHITENING_FACTOR**2) * wanted.means2d.T

@@ -91,7 +91,8 @@ STATISTICS_CASE = Case(
 def _random_marks(rng: Generator, count: int) -> Inputs:
     """Random inputs of the rules that mark rows.
 
-    Statistics, scales and opacities equal a rule's threshold, are the next float to it, or are not finite.
+    Many statistics, scales and opacities equal a rule's threshold, or are the next float above or below it. Some are
+    not finite.
     """
 
     def values(*around: float, size: tuple[int, ...] = (count,)) -> Float32:

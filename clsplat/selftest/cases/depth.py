@@ -71,7 +71,7 @@ def of_depth(bench: CaseBench) -> StageOutcome:
 
 
 def _slots(bench: CaseBench, blended: Blended, gradient: DeviceArray) -> Array:
-    """Launch the gradient of blending, and return the float64 sums (n, fields) of each Gaussian's slots."""
+    """Launch the gradient of blending, and return the float64 sums (n, columns) of each Gaussian's slots."""
     lists, pixels = bench.lists, (bench.inputs, blended, gradient)
     slots = blend_grad(bench.device, bench.work, lists, *pixels, fields=NEARNESS_SLOTS).get()
     sums = np.zeros((bench.model.count, NEARNESS_SLOTS.floats))

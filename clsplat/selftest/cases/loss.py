@@ -30,8 +30,10 @@ rounding may change the gradient's sign."""
 
 
 def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
-    """A random render and photograph (H, W, 3): of noise, of one colour, dark, or nearly equal. Half of the photographs
-    have 8-bit values."""
+    """Return a random render and a random photograph, (H, W, 3) each.
+
+    They are noise or of one colour, may be dark, and may be nearly equal. Half of the photographs have 8-bit values.
+    """
     width, height = size
     y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])
     if rng.random() < 0.3:
@@ -69,7 +71,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     first = _read(loss(device, work, image, photograph, *size, given.weight), size)
 
     def again(source: Array) -> float:
-        """Number of results that change if the kernel reads `source` instead of the planes."""
+        """Return the number of results that change if the kernel reads the interleaved photograph `source`."""
         as_loaded = target(device, work, source, background, in_planes=False)
         second = _read(loss(device, work, image, as_loaded, *size, given.weight), size)
         return float(sum(np.count_nonzero(second[name] != first[name]) for name in first))

@@ -56,10 +56,12 @@ MIN_NORMAL_COSINE = 1e-4
 """Least absolute cosine between a normal and the direction to the camera for the normal to be compared. Below it,
 rounding may change which side the camera sees."""
 MIN_TRANSMITTANCE_MARGIN = 1e-5
-"""Least absolute margin for a pixel to be compared: the distance of the transmittance from 0.5 and from the ends of
-slices, and the difference between the two largest weights."""
+"""Nearer than this to a threshold, rounding may change a pixel's result, so the pixel is not compared. In the test of
+channels, its transmittance is compared with 0.5, and its largest weight with the second largest. In the test of deep
+pictures, its transmittance is compared with the end of a slice."""
 MIN_MERGED_MARGIN = 1e-6
-"""Least margin for a pixel of merged slices to be compared. Its transmittance is a sum of up to 16 products."""
+"""In the test of merged deep pictures, pixels are not compared if a transmittance is nearer than this to the end of a
+slice, where rounding may change the result. The transmittance is a sum of up to 16 products."""
 DEEP_CASE_SLICES = 4
 """Number of slices per pixel in the test of deep pictures."""
 DEEP_SLICE_PARTS = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
@@ -71,7 +73,7 @@ every pixel, which takes a second for this number."""
 
 
 def _after(camera: Camera) -> Camera:
-    """The camera at the end of the motion: moved in x, y and z, with a larger fx."""
+    """Return the camera at the end of the tested motion: moved in x, y and z, with a larger fx."""
     return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
 
 
@@ -165,7 +167,7 @@ def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
 
 
 def launch_deep_merge(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Merge the deep pictures by deep_merge.cl."""
+    """Merge the inputs' deep pictures by deep_merge.cl. Returns a function that reads the merged picture."""
     count, bins, height, width, floats = given.pictures.shape
     planes = np.ascontiguousarray(given.pictures.transpose(0, 1, 4, 2, 3)).reshape(count, bins, floats, -1)
     weights = upload(device, np.ascontiguousarray(given.weights.reshape(count, -1)))
@@ -234,9 +236,10 @@ def _rays(bench: CaseBench) -> StageOutcome:
 
 
 def _camera_of(camera: Camera, model: CameraModel) -> Camera:
-    """Camera of the given model for a frozen scene. For a pinhole it is the scene's camera, drawn along rays.
+    """Return a camera of the given model that views a frozen scene. camera: the scene's pinhole camera.
 
-    For other models it is in the middle of the scene, with Gaussians all around, also at a panorama's poles and seam.
+    For the model pinhole, this camera is returned, drawn along rays. A camera of another model is put into the middle
+    of the scene, so that Gaussians are all around it, also at a panorama's poles and seam.
     """
     if model.is_pinhole:
         return camera.along_rays(by_rays=True)
@@ -269,7 +272,7 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
     parts = _tangent_parts(tangents, shown, splats)
     if bench.model.count <= MAX_GAUSSIANS_FOR_REFERENCE:
         picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
-        # The margin is three times as large, because float32 directions are off by 1e-7 at pixels 0.1 radians wide.
+        # three times as large as in other stages, as float32 directions are off by 1e-7 at pixels 0.1 radians wide
         clear = picture.margin > 3 * MIN_DECISION_MARGIN
         solid = clear & (picture.alpha > 0.5)
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
@@ -283,9 +286,10 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
-    """Splat columns of the visible Gaussians, by name: the device's values paired with the reference's.
+    """Return splat columns of the visible Gaussians, by name: the device's values paired with the reference's.
 
-    shown: mask (n,) of the visible Gaussians. splats: the device's splats of these alone.
+    tangents: the reference's projection of all n Gaussians. shown: mask (n,) of the visible Gaussians.
+    splats: the device's splats of the visible Gaussians.
     """
 
     def column(*names: str) -> Array:

@@ -70,7 +70,10 @@ SCAN_SIZES = (
 
 
 def _random_keys(rng: Generator, count: int) -> Inputs:
-    """Random sort keys of few bits or of many, and a base that is at most the smallest key."""
+    """Random sort keys. base: a number, at most the smallest key, that is subtracted from all keys before the sort.
+
+    bits: number of low bits, few or many, in which the differences are random.
+    """
     bits = int(rng.choice([1, 4, 5, 11, 12, 13, 22, 23, 24, 26, 27, 31, 32, 32]))
     base = int(rng.choice([0, 0, 2**32 - 2**bits, rng.integers(2**32 - 2**bits + 1)]))
     values = (base + rng.integers(0, 2**bits, count)).astype(np.uint32)
@@ -78,8 +81,10 @@ def _random_keys(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_keys(bench: CaseBench) -> list[Inputs]:
-    """Keys for the bitonic sort (base None) and for the radix sort. A scene's own keys would test only one of the
-    two."""
+    """Synthetic keys for the bitonic sort (`base` is None) and for the radix sort (`base` is 0).
+
+    The scene's own keys would test only one of the two sorts.
+    """
     sizes = ((400, 12), (3000, 20), (30_000 if bench.frozen.name == "crowd" else 5000, 32))
     found = [Inputs(keys=keys(51 + index, n, bits), bits=bits, base=0) for index, (n, bits) in enumerate(sizes)]
     found[0].base = None
@@ -139,7 +144,7 @@ SCAN_CASE = Case(
 _WHOLE_BOX = 16
 """Largest number of tiles in a box of which all tiles are listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
 _EVERYWHERE = 1e6
-"""Half width in pixels of an ellipse that reaches all tiles of its rows."""
+"""Half width in pixels of an ellipse that reaches every tile of the rows of tiles in which it lies."""
 _COUNTS = ("VISIBLE", "PAIRS", "LONGEST", "STOPPED")
 
 
@@ -174,8 +179,10 @@ def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.in
 
 
 def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.int64]:
-    """Random boxes (count, 4) of tiles for `splats_of_boxes`: empty, small, of whole rows, and now and then of all
-    tiles."""
+    """Random boxes (count, 4) of tiles, with x0, x1, y0 and y1 each. tiles: numbers of tiles across and down.
+
+    A box is empty, is small, has whole rows, or now and then all tiles.
+    """
     begin = rng.integers(0, tiles, (count, 2))
     end = np.minimum(begin + rng.integers(1, 5, (count, 2)), tiles)
     kind = rng.choice(4, count, p=(0.1, 0.7, 0.17, 0.03))
@@ -243,7 +250,7 @@ def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def _digits(lengths: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Number of binary digits of each length."""
+    """Return the number of binary digits of each tile list's length, by which the lists are ordered."""
     return np.array([int(length).bit_length() for length in lengths], np.int64)
 
 

@@ -115,10 +115,10 @@ def strategy(name: str) -> Any:
 
 
 def _of_gsplat(place: str, name: str) -> Any:
-    """Return what `place`, a module in place of gsplat's, gives for a `name` that clsplat lacks.
+    """Return the attribute `name`, which clsplat lacks, of the module `place` that replaces a module of gsplat.
 
-    This is a function that raises InputError, or a gsplat strategy. Raises AttributeError for other names, and
-    ImportError if gsplat is needed and not installed.
+    For a function that needs CUDA, the result is a function that raises InputError; for a strategy, gsplat's class.
+    Raises ImportError if gsplat is needed and not installed, and AttributeError for other names.
     """
     if name in absent_names.CUDA_ONLY_NAMES:
         return absent_names.refuses(name)
@@ -150,9 +150,9 @@ def _is_ours(value: Any) -> bool:
 
 
 def _with_one_radius(function: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]) -> Callable[..., Any]:
-    """Wrap `rasterization` to return one radius per splat, the larger of the two, as before gsplat 1.5.
+    """Wrap `rasterization` so that it returns one radius per splat, as before gsplat 1.5: the larger of the two radii.
 
-    The radii are (C, N), or (nnz,) if packed.
+    The radii in `meta` become (C, N), or (nnz,) if packed.
     """
 
     @functools.wraps(function)
