@@ -39,9 +39,9 @@ class BenchVerb(Verb):
     """Bundle of rasterizer settings: exact and default approximate nothing, fast approximates a little. A --rasterizer
     flag overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). With NAME.svg,
-    NAME-switches.svg shows the time that each setting saves without changing pictures, and NAME-error.svg the time and
-    error of each approximate setting."""
+    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). If FILE is NAME.svg,
+    the plots are NAME-switches.svg and NAME-error.svg. The first shows the time that each setting saves without
+    changing pictures; the second shows the time and error of each approximate setting."""
     overwrite: Flag = False
     """Replace existing plots."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)

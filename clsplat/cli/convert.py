@@ -242,10 +242,11 @@ def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
 def _edited(
     verb: ConvertVerb, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
-    """Return the source model after all edits, in the order listed by --help. Raises InputError if it is empty.
+    """Return the source model after all edits, in the order listed by --help.
 
-    source, others: paths and models of the source and of --merge.
+    source: path and model of the source. others: paths and models of the files of --merge.
     matrix: (4, 4), the transform of the edits; None if they do not transform the model.
+    Raises InputError if no Gaussian remains.
     """
     from clsplat.models import edit
 
@@ -387,8 +388,9 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
 def _measured(
     verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> SceneComparison:
-    """Measure PSNR in dB of the renders before and after conversion, against the photographs and between the two.
+    """Measure PSNR in dB of each view's renders before and after conversion.
 
+    Each render is compared with the photograph, and the two renders are compared with each other.
     original: the source model.
     read: the converted model, read from the target file. It is rendered from cameras transformed by `matrix`.
     matrix: (4, 4), the transform of the edits; None if they do not transform the model.

@@ -29,7 +29,7 @@ def make_views(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> tuple[list[Task], Shot]:
-    """Make the tasks of both eyes, or of one camera, by `make_tasks`. Returns them, and the first shot's chosen frames.
+    """Make the tasks of both eyes, or of one camera. Returns the tasks, and the chosen frames of the first shot.
 
     shots: shots by eye, "left" and "right"; without stereo a single shot with the key "".
     frames: numbers of the frames to render, as in --frames; None for all.

@@ -71,7 +71,7 @@ class AnimatedProperty:
 
 @dataclass(frozen=True, eq=False)
 class KeyedTrack:
-    """A `Track` from key frames.
+    """Placement of a model over time (`Track`), from key frames.
 
     where: prefix of error messages.
     channels: the model's animated properties by name; properties that are missing have their defaults.
@@ -136,7 +136,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
     (scale, turn, shift), (scale_after, turn_after, shift_after) = (
         edit.decompose(matrices[index], NODE_SIMILARITY_TOLERANCE) for index in (after - 1, after)
     )
-    # this is a rotation even if both matrices mirror
+    # the product of the two is a rotation, even if both mirror
     way = Rotation.from_matrix(turn_after @ turn.T).as_rotvec()
     matrix = np.eye(4)
     size = scale ** (1 - share) * scale_after**share
@@ -147,7 +147,10 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Within:
-    """`Track` of a model in a group: the model's track `inner`, moved along by the group's track `outer`."""
+    """Placement over time (`Track`) of a model in a group.
+
+    inner: the model's placement in the group. outer: the group's placement.
+    """
 
     inner: Track
     outer: Track

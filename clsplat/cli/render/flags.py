@@ -81,7 +81,7 @@ class RenderVerb(Verb):
     model without a run: undistort."""
     channels: Annotated[str, arg(metavar="NAME,...", help=_CHANNELS_HELP)] = "rgb"
     ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
-    """Property of the models' PLY files with an integer for each Gaussian, for --channels semantic."""
+    """Property of the models' PLY files that holds an integer id for each Gaussian, for --channels semantic."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians: black, white or three numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
@@ -137,7 +137,8 @@ class RenderVerb(Verb):
     """auto: a bar on a terminal, and a line for each frame written. json: one object a line for each frame, on standard
     output, or on standard error with --json. openjd: progress messages for Open Job Description."""
     profile: Flag = False
-    """Measure the fraction of time in which the device works. With --json also the time on each frame."""
+    """Measure the fraction of time in which the device works. With --json, also report the device's time
+    for each frame."""
     device: Annotated[str | None, arg(metavar="DEVICE,...|all")] = None
     """OpenCL device: an index, cpu, gpu, or part of a name, as listed by `clsplat devices`. Several, separated by
     commas, share the frames. If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""

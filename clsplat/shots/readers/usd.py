@@ -56,7 +56,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     """Read cameras like `read_usd`, from a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
-    # captures the messages that USD would print, as on a missing layer, which may not concern the camera
+    # captures the messages that USD would print. They may not concern the camera, as for a missing layer.
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     stage = open_stage(path, path)
     with readable(path):
@@ -141,7 +141,10 @@ def _optics(where: str, camera: Any, code: int, settings: Settings, metres: floa
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
-    """Return the name and first value of an attribute that is authored and differs from `usual`; otherwise ''."""
+    """Return the name and first unusual value of an attribute, if it is authored and has one; otherwise ''.
+
+    usual: the value that changes no picture. codes: time codes of the frames.
+    """
     attribute = prim.GetAttribute(name)
     if not attribute or not attribute.HasAuthoredValue():
         return ""

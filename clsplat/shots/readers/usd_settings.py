@@ -75,7 +75,7 @@ def window_named(window: tuple[float, float, float, float] | None) -> tuple[str,
 
 
 def camera_of_settings(stage: Any) -> str:
-    """Return the path of the camera that a render product or else the stage's render settings name; '' if none do."""
+    """Return the camera's path that a render product gives, or else the stage's render settings; '' if neither does."""
     settings = _stage_settings(stage)
     for prim in (*_products(settings), settings) if settings else ():
         if targets := prim.GetCameraRel().GetForwardedTargets():
