@@ -32,7 +32,7 @@ class BenchVerb(Verb):
     gaussians: int = 200_000
     """Number of Gaussians of the synthetic scene."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
-    """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the synthetic scene."""
+    """Size of the frame in pixels. If not given: the camera's size, or 1024x768 for the synthetic scene."""
     repeat: int = 5
     """Number of times that each frame and each step is measured. The printed times are medians."""
     preset: Preset = "default"

@@ -135,8 +135,8 @@ class ConvertVerb(Verb):
     """Bits of an SPZ file's spherical harmonics, 1 to 8, for band 1 and for the bands above. Fewer bits make a smaller
     file with less accurate reflections. 6,6 if not given; SPZ's own library uses 5,4."""
     scene: ScenePath = None
-    """Measure PSNR on this scene's held-out views before and after conversion, and between the two renders. If it is
-    the scene of the run, pixels that its masks exclude are not measured."""
+    """Measure PSNR on this scene's held-out views before and after conversion, and between the two renders. If the
+    source is a run that was trained on this scene, pixels that the scene's masks exclude are not measured."""
     test_every: int = TEST_EVERY
     """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0

@@ -29,7 +29,7 @@ SELFTEST_TABLE_HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms",
 
 @dataclass(frozen=True)
 class SelftestVerb(Verb):
-    """Test every device: build the kernels, and compare the results of each stage with float64 and stored digests.
+    """Test every device: build the kernels, compare each stage with its float64 reference and with stored digests.
 
     The exit status is 1 if a driver cannot be trusted. The verbs train, eval, render, view, bench and demo run a short
     form of this test when they first use a device. So does convert, if it renders. CLSPLAT_TRUST_DRIVER=1 skips the

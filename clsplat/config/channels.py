@@ -107,7 +107,7 @@ def floats_of(source: Source) -> dict[str, int]:
 
 
 def feature_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names in the kernels of those channels among `names` whose source is "features".
+    """Return the kernels' names of the channels among `names` whose `Channel.source` is "features".
 
     The order is that of the channels' planes on the device.
     """

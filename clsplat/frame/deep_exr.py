@@ -64,7 +64,7 @@ def write_deep(
                     counts, columns = _samples(some, convert, half=encoding.depth == "half")
                     seen.append(bool(counts.any()))
                     yield deep_data(folder / "rows.exr", counts, columns), len(counts)
-                del planes, some  # to free their memory before the next strip is drawn
+                del planes, some  # frees these arrays before the next strip is drawn
 
         write_rows(path, spec, "exr", pieces())
     return not any(seen)

@@ -59,8 +59,8 @@ class FrameRequest:
     at: function that returns the camera of the whole frame, in its final size, at a time in frames; 0 is this frame.
     after, before: cameras of the next and the previous frame, for the channels motion and backward.
     lens: lens distortion, as the position in an undistorted picture of each pixel; None for an undistorted frame.
-    sampling: settings of this frame's samples of shutter and lens; None uses the job's.
-    cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
+    sampling: settings of this frame's samples of shutter and lens; None uses the job's settings.
+    cut: function from a camera to the holdout surfaces in its picture; None without a holdout.
     models: function from a time to the Gaussians; None uses the pipeline's model.
     moved: the model at the next and at the previous frame, for the channels motion and backward; None if it does not
         move.
@@ -77,12 +77,12 @@ class FrameRequest:
 
 
 def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
-    """Return a step (`Pass`) that modifies, by `apply`, the drawing function (`Draw`) of every time."""
+    """Return a step (`Pass`) that applies `apply` to the drawing function (`Draw`) of each time."""
     return lambda draw: lambda time: apply(draw(time))
 
 
 def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, draw: DrawAt) -> DrawAt:
-    """Average the pictures that `draw` renders over the shutter's time and the lens's area.
+    """Average, over the shutter's time and the lens's area, the pictures that `draw` renders.
 
     Returns a function like `draw`. at: function from a time to the camera of the whole frame.
     """
@@ -164,7 +164,7 @@ class FramePipeline:
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
-        """Return a function (`Draw`) that renders in strips, which leave device memory for the model and its pairs."""
+        """Return a function (`Draw`) that renders in strips, so that the model and its pairs fit into device memory."""
         device, framing = self._renderer.device, self.config.framing
 
         def drawn(camera: Camera, names: Collection[str]) -> Planes:

@@ -133,5 +133,5 @@ def write_in_strips(
     if header.window is None:
         spec.full_height = camera.height
     pieces = chain(iter([first]), (pixels for pixels, _ in parts))
-    del first  # to free its memory before the third strip is drawn
+    del first  # frees the first strip before the third is drawn
     write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

@@ -68,7 +68,7 @@ def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDA
 
 
 def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray[Any]:
-    """Return the values of the pixels that contain the positions (h, w, 2); the value `nothing` where one is NaN."""
+    """Return the values of the pixels that contain the positions (h, w, 2); `nothing` where a position is NaN."""
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], np.floor(places), 0).astype(np.int64)
     x, y = (np.clip(at[:, :, axis], 0, plane.shape[1 - axis] - 1) for axis in (0, 1))

@@ -153,7 +153,7 @@ def read_manifest(path: Path) -> Manifest | None:
 
 
 def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
-    """Read a checkpoint's arrays `names`, and its state. Digests are not checked."""
+    """Read a checkpoint's state, and its arrays with these names. Digests are not checked."""
     arrays: Arrays = {}
     with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
         for name in {*names, STATE_KEY} & {name.removesuffix(".npy") for name in archive.namelist()}:

@@ -20,7 +20,7 @@ from clsplat.runs.run import OWNER_DIGITS, SCRATCH_SUFFIX, Run
 def owner_of(run: Run | None) -> str:
     """Return the digits with which the names of a training's scratch files begin.
 
-    run: run whose folder's path and inode are hashed to these digits; None for a training without a run.
+    run: run whose folder's path and inode are hashed to these digits; None hashes the machine and the process id.
     The inode tells two runs apart that have the same path, such as in two containers.
     """
     of = f"{run.path.resolve()} {run.path.stat().st_ino}" if run is not None else f"{machine_mark()} {os.getpid()}"

@@ -78,7 +78,7 @@ class JobModels:
 
     @property
     def count(self) -> int:
-        """Number of Gaussians in all models. For a model that changes over time, those of its first file count."""
+        """Number of Gaussians in all models. For a model that changes over time, only its first file counts."""
         return sum(model.count if isinstance(model, ModelSeries) else len(model) for model in self.models)
 
     @property
@@ -155,7 +155,7 @@ class JobModels:
         return Matte(tuple(str(number) for number in numbers.tolist()), owners.astype(np.int32))
 
     def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
-        """Return the tasks with the placements, near planes and kind of projection of the models.
+        """Return the tasks with the models' placements, near planes and kind of projection.
 
         Raises InputError for frames without a file and for invalid placements.
         """

@@ -35,8 +35,8 @@ def make_views(
     frames: numbers of the frames to render, as in --frames; None for all.
     pattern: pattern of the file names.
     resize: function that returns a camera at the size to render.
-    The tasks of the two eyes alternate. If the pattern has no field for the eye, they become views of one file. Raises
-    InputError like `make_tasks` and `Shot.only`.
+    The tasks of the two eyes alternate. If the pattern has no field for the eye, both eyes are views in one file.
+    Raises InputError like `make_tasks` and `Shot.only`.
     """
     chosen = {eye: shot if frames is None else shot.only(frames) for eye, shot in shots.items()}
     first = next(iter(chosen.values()))

@@ -172,7 +172,7 @@ def run_tasks(
                 room.release()  # no deadlock: frames start in order, so the frame to encode next is in memory
             on_done(record)
     except KeyboardInterrupt:
-        abandon()  # otherwise a thread may wait for the trial of a driver that hangs
+        abandon()  # ends trials of drivers: a driver that hangs would keep its thread waiting
         raise
     finally:
         frames.stop.set()

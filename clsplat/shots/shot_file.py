@@ -84,7 +84,7 @@ class KeyedTrack:
     held: bool = False
 
     def at(self, frame: float) -> Placement:
-        """Return the placement at a frame. Before the first key and after the last, it is the nearest key's."""
+        """Return the placement at a frame; before the first key and after the last, the nearest key's placement."""
 
         def value(name: str, *default: float, held: bool = self.held) -> Float64:
             channel = self.channels.get(name)
@@ -136,7 +136,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
     (scale, turn, shift), (scale_after, turn_after, shift_after) = (
         edit.decompose(matrices[index], NODE_SIMILARITY_TOLERANCE) for index in (after - 1, after)
     )
-    # the product of the two is a rotation, even if both mirror
+    # turn_after turn^T is a rotation, even if both factors mirror
     way = Rotation.from_matrix(turn_after @ turn.T).as_rotvec()
     matrix = np.eye(4)
     size = scale ** (1 - share) * scale_after**share
@@ -156,7 +156,7 @@ class Within:
     outer: Track
 
     def at(self, frame: float) -> Placement:
-        """The placement of the inner track, transformed by the outer one."""
+        """Return the placement by the track `inner`, transformed by the placement by `outer`."""
         return self.inner.at(frame).within(self.outer.at(frame))
 
     @property

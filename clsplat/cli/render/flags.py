@@ -74,7 +74,7 @@ class RenderVerb(Verb):
     """Render only these frames; all if not given. Ranges may have a step. Write --frames=-5-10 if it begins with a
     negative number."""
     usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
-    """Path or name of the camera, for a USD stage with several."""
+    """Path or name of the camera, for a USD stage with several cameras."""
     lenses: Annotated[Lenses | None, arg(metavar="undistort|native")] = None
     """Rendering of fisheye cameras of photographs. undistort: as the pinhole cameras that fit into them; native:
     through their own lens. If not given: as the run was trained. With --path, whose cameras are pinholes, and for a
@@ -103,10 +103,10 @@ class RenderVerb(Verb):
     quality: int = 95
     """Quality of JPEG files, from 1 to 100 (best)."""
     width: OptionalInt = None
-    """Width in pixels. If not given: from the height, or the camera's. If width and height change the camera's shape,
-    its vertical field of view is kept."""
+    """Width in pixels. If not given: follows from --height, else the camera's width. If width and height change the
+    camera's shape, its vertical field of view is kept."""
     height: OptionalInt = None
-    """Height in pixels. If not given: from the width, or the camera's."""
+    """Height in pixels. If not given: follows from --width, else the camera's height."""
     scale: float = 1.0
     """Factor on the camera's width and height, such as 0.5. It excludes --width and --height."""
     colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)

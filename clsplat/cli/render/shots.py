@@ -127,7 +127,7 @@ def with_stage(
 
 
 def _pixel_aspect_unapplied(task: Task) -> tuple[str, ...]:
-    """Return a note on the stage's pixel aspect ratio if it is not 1 and the picture's format cannot store it."""
+    """Return a note on the stage's pixel aspect ratio if this is not 1 and the picture's format cannot store it."""
     shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
     if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
         return ()

@@ -41,12 +41,12 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
     interpolation between samples. `Shot.unapplied` names authored settings that are not applied. USD's warnings become
     the shot's warnings.
 
-    size: width and height in pixels. A missing side follows from the resolution of the render settings, or without one
-      from the first frame's aperture. If both sides are missing, the size is that resolution.
-    prim: path or name of the camera, needed if the stage has several and its render settings name none.
+    size: width and height in pixels. A missing side follows from the resolution of the render settings, else from
+      the first frame's aperture. If both sides are missing, the size is that resolution.
+    prim: path or name of the camera, needed if the stage has several cameras and its render settings name none.
     The render settings also give the pixel aspect ratio and how the aperture is conformed to the size. Without them,
-    the aperture's width fills the picture's, and pixels are square. Raises InputError if the stage cannot be opened,
-    has no such camera, no size or invalid values, or if usd-core is not installed.
+    the aperture's width fills the picture's width, and pixels are square. Raises InputError if the stage cannot be
+    opened, has no such camera, no size or invalid values, or if usd-core is not installed.
     """
     survive(path, "clsplat.shots.readers.usd:read_here", size=size, prim=prim)
     return read_here(path, size, prim)
@@ -141,7 +141,7 @@ def _optics(where: str, camera: Any, code: int, settings: Settings, metres: floa
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
-    """Return the name and first unusual value of an attribute, if it is authored and has one; otherwise ''.
+    """Return the name and first unusual value of an authored attribute; '' if it has no unusual value.
 
     usual: the value that changes no picture. codes: time codes of the frames.
     """
@@ -183,7 +183,7 @@ def _moved(camera: Any) -> Iterator[Any]:
 def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
     """Return the whole time codes to render, and all times at which the camera or an ancestor's transform has a value.
 
-    The time codes are the stage's range. If it has none, they go from the first time with a value to the last. Each
+    The time codes are the stage's range. Without a range, they go from the first time with a value to the last. Each
     value is read once, so that an error is raised now if USD cannot read it.
     """
     attributes = camera.GetPrim().GetAttributes()

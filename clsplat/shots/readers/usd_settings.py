@@ -29,7 +29,7 @@ class Settings:
     window: left, bottom, right and top of the pixels to render, as fractions of the frame from its lower left corner.
     instantaneous: True if the shutter closes at the time at which it opens.
     unapplied: names of authored settings that are not applied.
-    A stage without render settings has the defaults: the aperture's width fills the picture's.
+    A stage without render settings has the defaults: the aperture's width fills the picture's width.
     """
 
     resolution: tuple[int, int] | None = None
