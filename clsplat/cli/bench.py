@@ -32,16 +32,16 @@ class BenchVerb(Verb):
     gaussians: int = 200_000
     """Number of Gaussians of the synthetic scene."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
-    """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the synthetic scene."""
+    """Size of the frame in pixels. If not given: the camera's size, or 1024x768 for the synthetic scene."""
     repeat: int = 5
     """Number of times that each frame and each step is measured. The printed times are medians."""
     preset: Preset = "default"
     """Bundle of rasterizer settings: exact and default approximate nothing, fast approximates a little. A --rasterizer
     flag overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). With NAME.svg,
-    NAME-switches.svg shows the time that each setting saves without changing pictures, and NAME-error.svg the time and
-    error of each approximate setting."""
+    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). If FILE is NAME.svg,
+    the plots are NAME-switches.svg and NAME-error.svg. The first shows the time that each setting saves without
+    changing pictures; the second shows the time and error of each approximate setting."""
     overwrite: Flag = False
     """Replace existing plots."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)

@@ -135,8 +135,8 @@ class ConvertVerb(Verb):
     """Bits of an SPZ file's spherical harmonics, 1 to 8, for band 1 and for the bands above. Fewer bits make a smaller
     file with less accurate reflections. 6,6 if not given; SPZ's own library uses 5,4."""
     scene: ScenePath = None
-    """Measure PSNR on this scene's held-out views before and after conversion, and between the two renders. If it is
-    the scene of the run, pixels that its masks exclude are not measured."""
+    """Measure PSNR on this scene's held-out views before and after conversion, and between the two renders. If the
+    source is a run that was trained on this scene, pixels that the scene's masks exclude are not measured."""
     test_every: int = TEST_EVERY
     """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0
@@ -242,10 +242,11 @@ def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
 def _edited(
     verb: ConvertVerb, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
-    """Return the source model after all edits, in the order listed by --help. Raises InputError if it is empty.
+    """Return the source model after all edits, in the order listed by --help.
 
-    source, others: paths and models of the source and of --merge.
+    source: path and model of the source. others: paths and models of the files of --merge.
     matrix: (4, 4), the transform of the edits; None if they do not transform the model.
+    Raises InputError if no Gaussian remains.
     """
     from clsplat.models import edit
 
@@ -387,8 +388,9 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
 def _measured(
     verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> SceneComparison:
-    """Measure PSNR in dB of the renders before and after conversion, against the photographs and between the two.
+    """Measure PSNR in dB of each view's renders before and after conversion.
 
+    Each render is compared with the photograph, and the two renders are compared with each other.
     original: the source model.
     read: the converted model, read from the target file. It is rendered from cameras transformed by `matrix`.
     matrix: (4, 4), the transform of the edits; None if they do not transform the model.

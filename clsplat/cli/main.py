@@ -2,7 +2,7 @@
 """The command line: from arguments to exit status.
 
 Exit status: 0 for success, 1 if the work failed, 2 for a wrong call or input, 130 if interrupted by Ctrl-C.
-After another signal it is 128 plus the signal's number (docs/interruptions.md).
+After another signal the status is 128 plus the signal's number (docs/interruptions.md).
 Errors are reported in one line on standard error; CLSPLAT_DEBUG=1 adds the traceback.
 With --json, an error is also printed to standard output as an object with the keys "error" and "status".
 """
@@ -62,7 +62,7 @@ def _run(arguments: list[str], services: Services) -> int:
                 traceback.print_exc()
             status = status_of(error)
             interrupted = " ".join(("interrupted", *map(str, error.args)))
-            with contextlib.suppress(OSError):  # the terminal may be closed already
+            with contextlib.suppress(OSError):  # printing fails if the terminal is closed
                 print(f"clsplat: {interrupted}", file=sys.stderr)
                 if "--json" in arguments:
                     print(as_json(interrupted, status), flush=True)

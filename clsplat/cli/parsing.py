@@ -42,8 +42,8 @@ VERBS = {
     "not finite.",
     "bench": "Measure each stage of a frame and of a training step, and the limits of the device in the same run.",
     "tune": "Find a device's quickest kernel shape by a short trial, and save it for later runs.",
-    "selftest": "Test every device: build the kernels, run each stage on frozen scenes, compare with "
-    "float64 and stored digests.",
+    "selftest": "Test every device: build the kernels, compare each stage with its float64 "
+    "reference and with stored digests.",
 }
 """Verbs in the order of --help, with the first sentence of each one's help.
 

@@ -29,11 +29,11 @@ SELFTEST_TABLE_HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms",
 
 @dataclass(frozen=True)
 class SelftestVerb(Verb):
-    """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
+    """Test every device: build the kernels, compare each stage with its float64 reference and with stored digests.
 
-    The exit status is 1 if a driver cannot be trusted. train, eval, render, view, bench, demo and a convert that
-    renders run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. This verb
-    also tries again the kernel shapes with which a driver failed before.
+    The exit status is 1 if a driver cannot be trusted. The verbs train, eval, render, view, bench and demo run a short
+    form of this test when they first use a device. So does convert, if it renders. CLSPLAT_TRUST_DRIVER=1 skips the
+    short form. This verb also tries again the kernel shapes with which a driver failed before.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"
@@ -102,8 +102,8 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
     """Return the content of --report: facts about the installation and about each device.
 
-    records: the entry of each device (`record`), to which this adds the device's limits, failures, and times. Times are
-    measured only on devices that can be trusted.
+    records: the entry of each device (`record`). The device's limits, failures and times are added to its entry. Times
+    are measured only on devices that can be trusted.
     """
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices

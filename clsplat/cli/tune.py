@@ -18,9 +18,9 @@ from clsplat.cli.session import Services
 class TuneVerb(Verb):
     """Find a device's quickest kernel shape by a short trial, and save it for later runs.
 
-    A shape sets how many pixels a work-item computes at once, and how many work-items share a tile. It also sets
-    whether these work-items divide the tile's pixels or its Gaussians among them in the gradient's kernel. A run is
-    resumed, or reproduced to the byte, only with the shape it was trained with. CLSPLAT_SHAPE=LANESxITEMS overrides
+    A shape sets how many pixels a work-item computes at once, and how many work-items share a tile. For the
+    gradient's kernel, it also sets what these work-items divide among them: the tile's pixels or its Gaussians. A run
+    is resumed, or reproduced to the byte, only with the shape it was trained with. CLSPLAT_SHAPE=LANESxITEMS overrides
     the saved shape.
     """
 

@@ -32,7 +32,7 @@ model."""
 
 @dataclass(frozen=True)
 class ViewVerb(Verb):
-    """Look at a model in the browser: the device renders, the page shows it. Ctrl-C ends it.
+    """Look at a model in the browser: the device renders, the page shows it. Ctrl-C ends the viewer.
 
     docs/viewer.md describes the page.
     """

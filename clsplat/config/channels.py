@@ -25,11 +25,12 @@ class Channel:
     kind: type of the values in a file. "colour" is half or float, as requested. "exact" is always float, as a half has
     only 11 bits. "whole" is uint32 if the channel has an EXR part of its own, else float.
     part: name of the channel's part in a multi-part EXR file.
-    source: the kernel that computes the values. "image": blend.cl. "features": features.cl, for channels.cl to blend.
-    "depths": channels.cl, into planes after the features. "whole": channels.cl, into an array of integers. "shares":
-    coverages of a Cryptomatte, blended like features, one for each object.
-    kernel: the channel's name in the kernels. For "depth", the macro FEATURE_DEPTH is the offset of this feature in a
-    Gaussian's row of features.
+    source: origin of the values. "image": blend.cl computes them. "features": features.cl computes them for each
+    Gaussian, and channels.cl blends them. "depths": channels.cl writes them to the planes that follow the
+    features' planes. "whole": channels.cl writes them to an array of integers. "shares": the coverages of a
+    Cryptomatte's objects, which are blended like features.
+    kernel: the channel's name in the kernels. The name "depth", for example, is in the macro FEATURE_DEPTH, the offset
+    of this feature in a Gaussian's row of features.
     signs: factors from the kernel's values to the file's, one for each float; empty if all are 1.
     note: explanation for --help. Consecutive channels with the same note are listed together.
     """
@@ -65,8 +66,8 @@ FRAME_CHANNELS: dict[str, Channel] = {
     "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
     "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
-"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. The v of the
-channels motion and backward points up in files, whereas y points down in docs/channels.md."""
+"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. In files, the
+second component (v) of the channels motion and backward points up; in the kernels it points down."""
 
 CRYPTOMATTE_LAYERS = 3
 """Number of layers of a Cryptomatte. Each layer stores the ids and coverages of two objects."""
@@ -106,7 +107,7 @@ def floats_of(source: Source) -> dict[str, int]:
 
 
 def feature_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names in the kernels of those channels among `names` whose source is "features".
+    """Return the kernels' names of the channels among `names` whose `Channel.source` is "features".
 
     The order is that of the channels' planes on the device.
     """

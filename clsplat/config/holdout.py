@@ -9,8 +9,8 @@ from typing import Literal
 Depths = Literal["z", "inverse", "ray"]
 
 HOLDOUT_SURFACE_FIELDS = ("Z", "BACK", "KEEP", "RATE")
-"""Fields of a holdout surface: depths of the front and back, transmittance, and log2 of the transmittance per unit of
-depth. RATE is 0 for a surface without thickness."""
+"""Fields of a holdout surface. Z and BACK: depths of its front and back. KEEP: its transmittance. RATE: log2 of the
+transmittance per unit of depth; 0 for a surface without thickness."""
 
 
 @dataclass(frozen=True)

@@ -143,9 +143,9 @@ class SamplingConfig:
     shutter_close: float | None = None
     """Time at which the shutter closes, in frames before (-) or after the frame's time, such as 0.25."""
     f_stop: float | None = None
-    """Depth of field: f-number of the lens, such as 2.8. Its focal length is the camera's, on a sensor of
-    --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in focus.
-    Requires --focus."""
+    """Depth of field: f-number of the lens, such as 2.8. The focal length follows from the camera's field of
+    view and --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in
+    focus. Requires --focus."""
     aperture: float | None = None
     """Depth of field: radius of the lens in the scene's units, instead of --f-stop; 0 is none. Requires --focus."""
     focus: float | None = None
@@ -297,7 +297,7 @@ class VideoConfig:
     """Settings by which a video is encoded."""
 
     fps: float | None = None
-    """Frames per second. If not given: the rate of the cameras' file, or 24 if it has none. 23.976, 29.97 and the like
+    """Frames per second. If not given: the rate of the cameras' file, else 24. The rates 23.976, 29.97 and the like
     are 24000/1001, 30000/1001 and so on."""
     crf: int = 18
     """Quality of an .mp4: 0 is the best, 51 the worst. 18 is about the lowest quality without a visible loss."""

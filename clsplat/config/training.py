@@ -29,8 +29,8 @@ Photos = Literal["auto", "exact", "8bit"]
 ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
-"""Number of training photographs that counts as many: from it on, a photograph is decoded only when a step first needs
-it, and --photos auto stores photographs with 8 bits per channel."""
+"""Number of training photographs that counts as many. With this number or more, a photograph is decoded only when a
+step first needs it, and --photos auto stores photographs with 8 bits per channel."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,12 @@ class OptimiserConfig:
         check_rules(self, "--optimiser.", rules)
         if self.late and self.sparse:
             raise InputError("--optimiser.late: excludes --optimiser.sparse, which drops the missed steps")
-        if self.late and self.beta1**2 >= self.beta2:  # the sum of a parameter's missed updates diverges
+        # the sum of a parameter's missed updates diverges if beta1^2 >= beta2
+        if self.late and self.beta1**2 >= self.beta2:
             raise InputError(
                 f"--optimiser.late: expected beta1^2 < beta2, but beta1 is {self.beta1} and beta2 {self.beta2}"
             )
-        if self.means_rate > 0 and self.means_rate_end == 0:  # log-linear decay to 0 would be 0 at once
+        if self.means_rate > 0 and self.means_rate_end == 0:  # exponential decay cannot end at 0
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
 
 

@@ -28,7 +28,7 @@ from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.deep_merge import deep_merge, merge_bytes
 
 DrawDeep = Callable[[Camera], Float32]
-"""Function that renders a deep picture, from a camera to planes, which may be a view of another array."""
+"""Function that takes a camera and returns the planes of its deep picture, which may be a view of another array."""
 Convert = Callable[[Float32, Float32], Float32]
 """Function from premultiplied rgb (h, w, 3) and its alpha (h, w) to rgb in another colour space."""
 Weighted = tuple[Float32, Float32]
@@ -116,9 +116,9 @@ class Merge:
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
     """Return a function (`DrawDeep`) that renders the mean of deep pictures over samples of shutter and lens.
 
-    It uses only size and window of the camera that it is called with.
+    Its argument is a camera, of which it uses only size and window.
 
-    draws, cameras: for each sample, a DrawDeep and a camera of the whole frame.
+    draws, cameras: for each sample, the function that renders it (`DrawDeep`) and its camera of the whole frame.
     """
 
     def blurred(camera: Camera) -> Float32:
@@ -132,8 +132,8 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
     """Return a function (`DrawDeep`) that renders warped deep pictures.
 
-    It uses only size and window of the camera that it is called with. A pixel is the mean over `Warp.samples` by
-    `Warp.samples` positions, each interpolated bilinearly, because the negative weights of a cubic filter would give
+    Its argument is a camera, of which it uses only size and window. A pixel is the mean of slices at `Warp.samples` by
+    `Warp.samples` positions. Interpolation is bilinear, because the negative weights of a cubic filter would give
     invalid slices. Pixels in which nothing is visible have no slices.
     """
 

@@ -43,9 +43,10 @@ def write_deep(
 ) -> bool:
     """Draw and write a deep scanline EXR, atomically. Returns True if the picture is empty.
 
-    Channels are R, G, B, A, Z and ZBack. A pixel has at most `bins` slices; each is a sample at a single depth. Colours
-    are half or float according to `encoding`, in the colour space of `convert`; depths are float. Strips of `rows` rows
-    limit the memory. Raises InputError and ClsplatError like `images.frame_files.write_channels`.
+    Channels are R, G, B, A, Z and ZBack. A pixel has at most `bins` slices; each is a sample at a single depth.
+    `convert` gives colours in the file's colour space. `encoding` makes them half or float; depths are float. The
+    picture is drawn in strips of `rows` rows, to limit the memory. Raises InputError and ClsplatError like
+    `images.frame_files.write_channels`.
     """
     encoding, header = encoding or Encoding(), header or FrameFileHeader()
     if path.suffix.lower() != ".exr":
@@ -63,7 +64,7 @@ def write_deep(
                     counts, columns = _samples(some, convert, half=encoding.depth == "half")
                     seen.append(bool(counts.any()))
                     yield deep_data(folder / "rows.exr", counts, columns), len(counts)
-                del planes, some  # frees the memory before the next strip
+                del planes, some  # frees these arrays before the next strip is drawn
 
         write_rows(path, spec, "exr", pieces())
     return not any(seen)

@@ -22,7 +22,7 @@ Planes = dict[str, NDArray[Any]]
 """Channels by name, (height, width) or (height, width, floats). rgb is composited over the background. Over black it is
 premultiplied by alpha."""
 Draw = Callable[[Camera, Collection[str]], Planes]
-"""Function that renders a picture, from a camera and the names of channels to the channels' planes."""
+"""Function that takes a camera and names of channels, renders the picture, and returns the channels' planes."""
 
 
 def drawn_by(
@@ -43,7 +43,7 @@ def drawn_by(
     moved, earlier: the Gaussians at the next and the previous frame, for these channels; None if they do not move.
     mattes: Cryptomatte mattes, by channel name.
 
-    The planes may be non-contiguous, as the encoder makes them contiguous, perhaps in another thread.
+    The planes may be non-contiguous, because the encoder makes them contiguous, perhaps in another thread.
     """
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:

@@ -44,8 +44,8 @@ class Cut:
 
     @property
     def goes_on(self) -> bool:
-        """True if the holdout may continue outside the frame: surfaces touch an edge, and the file has no pixels
-        beyond it."""
+        """True if the holdout may continue outside the frame: surfaces touch an edge of the frame, and the file has no
+        pixels beyond that edge."""
         counts, (width, height) = self._holdout.surfaces.counts, self._holdout.size
         left, top = -self._holdout.x, -self._holdout.y
         right, bottom = left + width - counts.shape[1], top + height - counts.shape[0]

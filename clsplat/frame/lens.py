@@ -100,8 +100,8 @@ class Warp:
     def at(self, x: Float64, y: Float64) -> Float64:
         """Return the positions (h, w, 2) in the undistorted frame that belong to x (w,), y (h,) in the warped frame.
 
-        All are in pixels, the result in multiples of PLACE_STEP_PX. It is NaN where nothing is visible, and more than
-        MAX_BEYOND_EDGE_FRAMES frame sizes beyond an edge of the undistorted frame.
+        All are in pixels. The result is rounded to multiples of PLACE_STEP_PX. It is NaN where nothing is visible, and
+        where it would be more than MAX_BEYOND_EDGE_FRAMES frame sizes beyond an edge of the undistorted frame.
         """
         places = np.round(self.source.places(self.frame, x, y) / PLACE_STEP_PX) * PLACE_STEP_PX
         size = np.array([self.frame.width, self.frame.height])

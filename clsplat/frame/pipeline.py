@@ -45,20 +45,22 @@ equal samples may differ from them by rounding."""
 
 
 DrawAt = Callable[[float], Draw]
-"""Function from a time to the `Draw` at this time. The time is relative to the frame, in frames; 0 if nothing moves."""
+"""Function that takes a time and returns the function (`Draw`) that renders the frame as it is at this time.
+
+The time is relative to the frame, in frames; 0 if nothing moves."""
 Pass = Callable[[DrawAt], DrawAt]
-"""A step in making a frame: a function from the `DrawAt` of the previous step to the `DrawAt` of this one."""
+"""A step in making a frame. It takes the drawing function (`DrawAt`) of the previous step, and returns its own."""
 
 
 @dataclass(frozen=True)
 class FrameRequest:
     """A frame to render by a `FramePipeline`.
 
-    at: function from a time to the camera of the whole frame in its final size. The time is in frames, 0 at this frame.
+    at: function that returns the camera of the whole frame, in its final size, at a time in frames; 0 is this frame.
     after, before: cameras of the next and the previous frame, for the channels motion and backward.
     lens: lens distortion, as the position in an undistorted picture of each pixel; None for an undistorted frame.
-    sampling: settings of this frame's samples of shutter and lens; None uses the job's.
-    cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
+    sampling: settings of this frame's samples of shutter and lens; None uses the job's settings.
+    cut: function from a camera to the holdout surfaces in its picture; None without a holdout.
     models: function from a time to the Gaussians; None uses the pipeline's model.
     moved: the model at the next and at the previous frame, for the channels motion and backward; None if it does not
         move.
@@ -75,18 +77,21 @@ class FrameRequest:
 
 
 def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
-    """Return a pass that applies a function to the `Draw` of every time."""
+    """Return a step (`Pass`) that applies `apply` to the drawing function (`Draw`) of each time."""
     return lambda draw: lambda time: apply(draw(time))
 
 
 def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, draw: DrawAt) -> DrawAt:
-    """Return a `DrawAt` that averages the pictures of `draw` over the time of the shutter and the area of the lens."""
+    """Average, over the shutter's time and the lens's area, the pictures that `draw` renders.
+
+    Returns a function like `draw`. at: function from a time to the camera of the whole frame.
+    """
     (middle, cameras), times = sample_cameras(at, sampling), sampling.sample_times
     return lambda time: sampled(draw(time), middle, cameras, lambda index: draw(times[index]))
 
 
 class FramePipeline:
-    """Renderer of the frames of a job, with all passes from the kernels to the file's colours."""
+    """Renderer of the frames of a job: runs the kernels and all later passes, then converts to the file's colours."""
 
     def __init__(
         self,
@@ -112,7 +117,7 @@ class FramePipeline:
         self._mattes = mattes or {}
 
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
-        """Return a function (`Draw`) that renders a frame, and one that converts its planes to the file's colours.
+        """Return a function (`Draw`) that renders a frame, and one that converts the result to the file's colours.
 
         The first is called with the camera of the picture or of a strip, and uses only this camera's size and window.
         The second does not use the device.
@@ -159,7 +164,7 @@ class FramePipeline:
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
-        """Return a function (`Draw`) that renders in strips, which leave device memory for the model and its pairs."""
+        """Return a function (`Draw`) that renders in strips, so that the model and its pairs fit into device memory."""
         device, framing = self._renderer.device, self.config.framing
 
         def drawn(camera: Camera, names: Collection[str]) -> Planes:
@@ -212,7 +217,7 @@ class FramePipeline:
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if the planes of `draw`, before conversion, show only the background; None if no channel shows it."""
+        """True if the planes of `draw`, before conversion, show only the background; None if no channel can tell."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()

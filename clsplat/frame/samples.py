@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averages of a frame over samples: over the area of a pixel (supersampling), the time of the shutter, and the lens.
 
-The positions of samples are fixed, and samples of shutter and lens have equal weights. So frames can be repeated to the
-last bit, as without samples. Only linear light is averaged. Channels that cannot be averaged come from a single sample.
+The positions of samples are fixed, and samples of shutter and lens have equal weights. So a frame has the same bits
+each time it is rendered. Only linear light is averaged. Channels that cannot be averaged come from a single sample.
 """
 
 from __future__ import annotations
@@ -112,10 +112,10 @@ def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
 
 
 def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
-    """The camera at the middle of shutter time and lens, and the camera of each sample, all of whole frames.
+    """The camera at the middle of shutter time and lens, and the camera of each sample. All show whole frames.
 
-    at: function from a time, relative to the frame in frames, to the camera, such as `Shot.at`.
-    If there is a single sample, its camera is the one at the middle.
+    at: function that returns the camera at a time in frames, relative to the frame.
+    A single sample has the camera at the middle.
     """
     middle = at(config.middle)
     if not config.on or config.samples == 1:
@@ -134,7 +134,8 @@ def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callab
     """Return a function (`Draw`) whose rgb and alpha are means over samples. Other channels cannot be averaged and come
     from the middle camera.
 
-    middle, cameras: cameras of whole frames. The result uses only size and window of the camera that it is called with.
+    middle, cameras: cameras of whole frames.
+    The function's argument is a camera, of which it uses only size and window.
     light: function from a sample's number to the sample's `Draw`; None uses `draw` for all samples.
     `draw` must return rgb in linear light. Sums are float64, in the order of the cameras.
     """

@@ -60,7 +60,7 @@ def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> i
     floats = DEEP_FLOATS * bins
     most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
     pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with 2 TILE columns of padding
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # up to 2 TILE columns are padding
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
@@ -92,7 +92,7 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
     """Raise InputError if an EXR file of several parts or views would have to be written in strips.
 
-    A file stores whole parts and views one after the other, so that it cannot be written by rows of all of them.
+    Such a file stores one whole part or view after the other, and so cannot be written from strips that have them all.
 
     views: number of views in the file, 2 for a stereo pair.
     """
@@ -133,5 +133,5 @@ def write_in_strips(
     if header.window is None:
         spec.full_height = camera.height
     pieces = chain(iter([first]), (pixels for pixels, _ in parts))
-    del first  # frees the first strip's memory before the third is drawn
+    del first  # frees the first strip before the third is drawn
     write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

@@ -26,7 +26,7 @@ _SAMPLE_ROWS_PER_BATCH = 128
 def warped(draw: Draw, warp: Warp) -> Draw:
     """Return a function (`Draw`) that renders warped pictures.
 
-    It uses only size and window of the camera that it is called with. `draw` renders windows of the undistorted frame,
+    Its argument is a camera, of which it uses only size and window. `draw` renders windows of the undistorted frame,
     with rgb in linear light. A pixel's rgb and alpha are means of `Warp.samples` x `Warp.samples` samples, interpolated
     by the Catmull-Rom cubic. Other channels come from the nearest pixel. Where nothing is visible, ids are -1 and all
     other values 0.
@@ -68,7 +68,7 @@ def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDA
 
 
 def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray[Any]:
-    """Values of the pixels at positions (h, w, 2); `nothing` where a position is NaN."""
+    """Return the values of the pixels that contain the positions (h, w, 2); `nothing` where a position is NaN."""
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], np.floor(places), 0).astype(np.int64)
     x, y = (np.clip(at[:, :, axis], 0, plane.shape[1 - axis] - 1) for axis in (0, 1))

@@ -142,7 +142,7 @@ def scene_of(path: Path) -> str | None:
 def read_manifest(path: Path) -> Manifest | None:
     """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged.
 
-    Raises OSError if the file cannot be read now. It may still be intact, and need its scratch file.
+    Raises OSError if the file cannot be read now. The checkpoint may still be intact, and need its scratch file.
     """
     try:
         return manifest_of(*_part(path, *MANIFEST_ARRAYS))
@@ -153,7 +153,7 @@ def read_manifest(path: Path) -> Manifest | None:
 
 
 def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
-    """Read a checkpoint's state, and those of its arrays that `names` lists. Digests are not checked."""
+    """Read a checkpoint's state, and its arrays with these names. Digests are not checked."""
     arrays: Arrays = {}
     with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
         for name in {*names, STATE_KEY} & {name.removesuffix(".npy") for name in archive.namelist()}:

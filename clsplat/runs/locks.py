@@ -40,7 +40,7 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
     verb: verb of clsplat, such as "train", to name this process in the error of others.
 
     Raises InputError, which names the process that holds the lock, and OSError if no file can be created there.
-    On a file system without locks this only warns.
+    On a file system without locks, the function only warns.
     """
     key = os.path.realpath(folder)
     if key in _held:
@@ -72,7 +72,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
                 who = _who(file)
                 file.close()
                 raise InputError(
-                    f"{folder}: is being written by {who}; wait until that has ended, or choose another folder"
+                    f"{folder}: is being written by {who}; wait until that process has ended, or choose another folder"
                 ) from None
             if error.errno not in _NO_LOCKING_ERRNOS:
                 file.close()

@@ -14,7 +14,7 @@ from clsplat.scenes.scene import View
 def through_refined(views: Sequence[View], run: Run | None) -> list[View]:
     """Return copies of the views with the lenses that `run` has refined; poses stay. Raises InputError.
 
-    run: None, or a run without refined lenses, leaves the views unchanged.
+    The views are returned unchanged if `run` is None or has refined no lenses.
     """
     if run is None or not run.config.refine_lenses or not run.refined_path.is_dir():
         return list(views)

@@ -124,7 +124,7 @@ class Run:
         return cls(path, config, scene)
 
     def keep_config(self, config: TrainConfig) -> None:
-        """Write config.toml if the settings differ from those in it."""
+        """Write config.toml if the settings in `config` differ from the settings in the file."""
         if config != self.config:
             atomic_write(self.config_path, config_text(config, self.scene).encode())
             self.config = config
@@ -256,7 +256,7 @@ class Run:
         return True
 
     def _located(self, manifest: Manifest) -> Manifest:
-        """Return the manifest with the path of its scratch file: in `scratch_path` if it is there, else as recorded."""
+        """Return the manifest with its scratch file's path: in `scratch_path` if the file is there, else unchanged."""
         here = self.scratch_path.absolute() / manifest.path.name
         return replace(manifest, path=here) if here.is_file() else manifest
 

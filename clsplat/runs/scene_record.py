@@ -111,7 +111,7 @@ def read(run: Run) -> dict[str, Any] | None:
 
 
 def length_unit_of(record: dict[str, Any]) -> float | None:
-    """Return the length unit with which the training began, from scene.json. None: it was the scene's extent."""
+    """Return the length unit in scene.json, with which the training began; None if this was the scene's extent."""
     unit = record.get("length_unit")
     return None if unit is None else float(unit)
 
@@ -180,8 +180,8 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
     others = [file for _, file in run.checkpoints() if (digest := scene_of(file)) and digest not in known]
     if others and not accept:
         raise InputError(
-            f"{others[-1]}: is from a training on another scene than {run.path}, expected a checkpoint of this run; "
-            "remove it, or go on from it with --accept-changes"
+            f"{others[-1]}: is from a training on another scene than that of {run.path}, expected a checkpoint of "
+            "this run; remove it, or go on from it with --accept-changes"
         )
     now = record_of(scene, resolution)
     changes = differences(earlier, now)
@@ -225,7 +225,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        # the first word is the digest of the photograph alone, without its mask
+        # the first word of "blake2b" is the digest of the photograph alone, without its mask
         and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
     reasons = []

@@ -18,11 +18,10 @@ from clsplat.runs.run import OWNER_DIGITS, SCRATCH_SUFFIX, Run
 
 
 def owner_of(run: Run | None) -> str:
-    """Return the digits with which the names of a training's scratch files begin. run: None for a training without a
-    run.
+    """Return the digits with which the names of a training's scratch files begin.
 
-    For a run they are a digest of the folder's path and inode. The inode tells two runs apart that have the same path:
-    one that was renamed, or one in another container.
+    run: run whose folder's path and inode are hashed to these digits; None hashes the machine and the process id.
+    The inode tells two runs apart that have the same path, such as in two containers.
     """
     of = f"{run.path.resolve()} {run.path.stat().st_ino}" if run is not None else f"{machine_mark()} {os.getpid()}"
     return hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]
@@ -52,11 +51,11 @@ class ScratchFiles:
         return path.name.startswith(self._owner) or inside
 
     def may_write(self, path: Path) -> bool:
-        """True if this training may continue to write to `path`: only it can need the file, which is in `folder`."""
+        """True if this training may continue to write to `path`, a file in `folder` that no other training needs."""
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
-        """Protect the slots of `store` that checkpoints need. If its file is on a network disk, measure its speed."""
+        """Protect the slots in the store's file that checkpoints need. Report the file's speed on a network disk."""
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count
@@ -64,7 +63,7 @@ class ScratchFiles:
         store.slots.hold(self._kept(path))
 
     def saved(self, store: ChunkStore | None) -> None:
-        """Update after a checkpoint: protect the slots that it names, and remove files that no checkpoint names.
+        """Protect the slots that the new checkpoint names, and remove files that no checkpoint names.
 
         store: the store of the model; None if the model is not in a scratch file.
         """

@@ -163,8 +163,8 @@ def render_on_farm(
 def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
     """Yield the results of `render_frame` in the order in which frames finish.
 
-    Only some tasks are submitted at a time, because a job may have a million. For a video they begin with the frame to
-    encode next, which limits the number of finished frames that wait for that frame in memory.
+    Only some tasks are submitted at a time, because a job may have a million. For a video, the submitted tasks begin
+    with the frame to encode next. This limits the number of finished frames that wait for that frame in memory.
     """
     from distributed import CancelledError, KilledWorker, as_completed
 

@@ -202,7 +202,7 @@ class FrameRenderer:
         draw, finish = pipeline.draw(frame)
         rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
-            # again, because the memory of a deep holdout depends on its surfaces
+            # check again, because the memory of a deep holdout depends on its surfaces
             check_parts(camera, encoding, views)
             blanks: list[bool | None] = []
 
@@ -234,12 +234,12 @@ class FrameRenderer:
         return lambda time: ensemble.at(placed[time]), (moved("motion", middle + 1), moved("backward", middle - 1))
 
     def _trust(self, camera: Camera) -> None:
-        """Run the self-test of projection along rays before the first frame of a camera model along rays."""
+        """Run the self-test of projection along rays before the first frame whose camera projects along rays."""
         if not camera.model.along_rays or self._rays_tested:
             return
 
         device = self._renderer.device
-        if require(device, RAY_STAGES) is not device:  # another shape works, but the job keeps its shape
+        if require(device, RAY_STAGES) is not device:  # another kernel shape works, but a job keeps its shape
             raise DriverError(
                 f"{device.name}: the driver failed in the kernel shape {device.shape.label}, but another shape works; "
                 "run the command again"
@@ -247,7 +247,7 @@ class FrameRenderer:
         self._rays_tested = True
 
     def _rows(self, camera: Camera, planes: int) -> int:
-        """Return the number of rows of a strip of the camera's picture, or its height if it needs no strips.
+        """Return the number of rows of a strip of the camera's picture, or the picture's height if it needs no strips.
 
         planes: bytes of device memory per pixel that a holdout takes.
         """

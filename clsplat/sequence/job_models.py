@@ -78,7 +78,7 @@ class JobModels:
 
     @property
     def count(self) -> int:
-        """Number of Gaussians in all models. For a model that changes over time, those of its first file count."""
+        """Number of Gaussians in all models. For a model that changes over time, only its first file counts."""
         return sum(model.count if isinstance(model, ModelSeries) else len(model) for model in self.models)
 
     @property
@@ -127,7 +127,8 @@ class JobModels:
     def _objects(self) -> Matte:
         """Make a Cryptomatte with one object for each model, and one for each volume of a model.
 
-        A Gaussian in a volume belongs to the volume's object, not to the model's; in several volumes, to the first's.
+        A Gaussian in a volume belongs to the volume's object, not to the model's. If several volumes contain it, the
+        first of them counts.
         """
         names, owners = list(self.names), []
         for index, model in enumerate(self.still):
@@ -154,7 +155,7 @@ class JobModels:
         return Matte(tuple(str(number) for number in numbers.tolist()), owners.astype(np.int32))
 
     def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
-        """Return the tasks with the models' placements and near planes, and cameras along rays if the models need them.
+        """Return the tasks with the models' placements, near planes and kind of projection.
 
         Raises InputError for frames without a file and for invalid placements.
         """

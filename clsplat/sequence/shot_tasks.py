@@ -29,14 +29,14 @@ def make_views(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> tuple[list[Task], Shot]:
-    """Make the tasks of both eyes, or of one camera, by `make_tasks`. Returns them, and the first shot's chosen frames.
+    """Make the tasks of both eyes, or of one camera. Returns the tasks, and the chosen frames of the first shot.
 
     shots: shots by eye, "left" and "right"; without stereo a single shot with the key "".
     frames: numbers of the frames to render, as in --frames; None for all.
     pattern: pattern of the file names.
     resize: function that returns a camera at the size to render.
-    The tasks of the two eyes alternate. If the pattern has no field for the eye, they become views of one file. Raises
-    InputError like `make_tasks` and `Shot.only`.
+    The tasks of the two eyes alternate. If the pattern has no field for the eye, both eyes are views in one file.
+    Raises InputError like `make_tasks` and `Shot.only`.
     """
     chosen = {eye: shot if frames is None else shot.only(frames) for eye, shot in shots.items()}
     first = next(iter(chosen.values()))

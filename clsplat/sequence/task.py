@@ -121,7 +121,7 @@ class Task:
         these channels are not requested.
     stretch: cameras by time while the shutter is open; None for a static camera.
     before: state of the file when the job began, by `finished_frames.stamp`.
-    sampling: shutter and lens of this frame; None means the job's.
+    sampling: shutter and lens of this frame; None uses the job's settings.
     optics: shutter and lens in the USD stage; None without a stage.
     eye: left or right of a stereo pair; empty without stereo.
     right: task of the right eye, if one file holds both.
@@ -200,7 +200,10 @@ def sampling_of(task: Task, pictures: PictureConfig) -> SamplingConfig:
 
 @dataclass(frozen=True)
 class MatteNames:
-    """A Cryptomatte channel with the names of its objects, and a digest of the array of each Gaussian's object."""
+    """A Cryptomatte channel with the names of its objects.
+
+    digest: digest of the array with the index of each Gaussian's object.
+    """
 
     channel: str
     names: tuple[str, ...]
@@ -309,9 +312,9 @@ def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
     """Return the time from which motion is extrapolated to `time`; None if `time` needs no extrapolation.
 
-    Both times are in frames relative to the task's frame. Only times before the first or after the last frame of a shot
-    of several frames are extrapolated, from that frame; in a USD stage, whose camera is defined while the shutter is
-    open, from the shutter's middle.
+    Both times are in frames relative to the task's frame. Only times outside a shot of several frames need
+    extrapolation. It starts from the shot's first or last frame; in a USD stage from the shutter's middle, because the
+    stage defines the camera while the shutter is open.
     """
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
         return None
@@ -384,7 +387,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    # render frames again that versions without clipping at the far plane have rendered
+    # changes the digest, so that frames of versions without clipping at the far plane are rendered again
     made += ("far",) if task.camera.far < inf else ()
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:

@@ -42,7 +42,8 @@ from clsplat.sequence.task import (
 Result = tuple[Record, VideoPlanes | None]
 """Record of a frame, and the planes to encode if the frame belongs to a video."""
 WRITE_QUEUE_BYTES = 1 << 30
-"""Main memory in bytes that frames in progress may take. Two frames more than devices are always allowed."""
+"""Limit of main memory, in bytes, for frames in progress. At least (number of devices + 2) frames are allowed, whatever
+their size."""
 ENCODING_COPIES = 3
 """Number of copies of a frame in memory while it is encoded: the rendered, the assembled and the converted frame."""
 
@@ -168,10 +169,10 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # no deadlock: frames start in order, so the next to encode is in memory already
+                room.release()  # no deadlock: frames start in order, so the frame to encode next is in memory
             on_done(record)
     except KeyboardInterrupt:
-        abandon()  # a thread may wait for the trial of a driver that hangs
+        abandon()  # ends trials of drivers: a driver that hangs would keep its thread waiting
         raise
     finally:
         frames.stop.set()

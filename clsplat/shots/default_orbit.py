@@ -172,7 +172,7 @@ def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
     wanted = REGION_DETAIL_FRACTION * detail.sum()
     while (inside := np.linalg.norm(means - centre, axis=1) <= radius).any() and detail[inside].sum() > wanted:
         centre, radius = np.average(means[inside], axis=0, weights=detail[inside]), BALL_SHRINK_FACTOR * radius
-        if radius <= MAX_SCENE_REGION_RADIUS_RATIO * whole / 100:  # stops, as all detail is in one place
+        if radius <= MAX_SCENE_REGION_RADIUS_RATIO * whole / 100:  # all detail is in one place
             break
     if radius > MAX_SCENE_REGION_RADIUS_RATIO * whole:
         return middle + gaussians.origin, whole

@@ -90,7 +90,11 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
 
 
 def _moved(camera: Camera, values: Float64, rotation: Float64, position: Float64) -> Camera:
-    """Copy a camera with another pose and lens. values: roll (not used), logs of fx and fy, cx, cy. position: (3,)."""
+    """Copy a camera with another pose and lens.
+
+    values: (5,), the roll, which is not used, the logarithms of fx and fy, and cx and cy.
+    rotation: (3, 3), of cam_from_world. position: (3,), the camera's centre.
+    """
     fx, fy = np.exp(values[1:3])
     return replace(
         camera,

@@ -90,7 +90,7 @@ def targets(
 ) -> tuple[Camera | None, Camera | None]:
     """Return the cameras of the next and the previous frame, to which the motion vectors of a frame point.
 
-    motion, backward: True to return the next frame's camera, and the previous frame's; False to return None for it.
+    motion: True to return the next frame's camera; otherwise it is None. backward: the same for the previous frame.
     resize: function that adapts a camera to the size of the pictures.
     index: index of the frame in the shot.
     middle: middle of the shutter, in frames. For a shot that has `moment`, the cameras are one frame from this time.

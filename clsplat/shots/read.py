@@ -209,7 +209,7 @@ def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Fram
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
-        # a COLMAP model below colmap/ is nerfstudio's, and its world is not that of the transforms.json next to it
+        # a COLMAP model below colmap/ is nerfstudio's, whose transforms.json next to it has another world
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:

@@ -96,7 +96,7 @@ class Shot:
     def without_optics(self) -> Shot:
         """Return the shot without the shutter and lens of a USD stage. Their settings are added to `unapplied`."""
         named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
-        found = {name.partition(" ")[0]: name for name in reversed(named)}  # the first value of each setting
+        found = {name.partition(" ")[0]: name for name in reversed(named)}  # keeps the first value of each setting
         frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)
         return replace(self, frames=frames, unapplied=(*self.unapplied, *reversed(found.values())))
 

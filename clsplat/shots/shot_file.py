@@ -71,7 +71,7 @@ class AnimatedProperty:
 
 @dataclass(frozen=True, eq=False)
 class KeyedTrack:
-    """A `Track` from key frames.
+    """Placement of a model over time (`Track`), from key frames.
 
     where: prefix of error messages.
     channels: the model's animated properties by name; properties that are missing have their defaults.
@@ -84,7 +84,7 @@ class KeyedTrack:
     held: bool = False
 
     def at(self, frame: float) -> Placement:
-        """Return the placement at a frame. Before the first key and after the last, it is the nearest key's."""
+        """Return the placement at a frame; before the first key and after the last, the nearest key's placement."""
 
         def value(name: str, *default: float, held: bool = self.held) -> Float64:
             channel = self.channels.get(name)
@@ -136,7 +136,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
     (scale, turn, shift), (scale_after, turn_after, shift_after) = (
         edit.decompose(matrices[index], NODE_SIMILARITY_TOLERANCE) for index in (after - 1, after)
     )
-    # this is a rotation even if both matrices mirror
+    # turn_after turn^T is a rotation, even if both factors mirror
     way = Rotation.from_matrix(turn_after @ turn.T).as_rotvec()
     matrix = np.eye(4)
     size = scale ** (1 - share) * scale_after**share
@@ -147,13 +147,16 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Within:
-    """`Track` of a model in a group: the model's track `inner`, moved along by the group's track `outer`."""
+    """Placement over time (`Track`) of a model in a group.
+
+    inner: the model's placement in the group. outer: the group's placement.
+    """
 
     inner: Track
     outer: Track
 
     def at(self, frame: float) -> Placement:
-        """The placement of the inner track, transformed by the outer one."""
+        """Return the placement by the track `inner`, transformed by the placement by `outer`."""
         return self.inner.at(frame).within(self.outer.at(frame))
 
     @property

@@ -39,7 +39,7 @@ GAUSSIAN_COLOUR_ATTRIBUTES = ("radiance:sphericalHarmonicsDegree", "primvars:dis
 
 @dataclass(frozen=True, eq=False)
 class StageTrack:
-    """The `Track` of a prim in a USD stage: its world transform and visibility over time.
+    """World transform and visibility of a USD stage's prim over time (`Track`).
 
     where: prefix of error messages.
     place: the prim's transforms and visibility in the stage.

@@ -57,7 +57,7 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
     """
     positions = np.stack([camera.position for camera in cameras])
     forward = np.stack([camera.rotation[2] for camera in cameras])
-    # the squared distance to an axis is |P (x - c)|^2 with P = 1 - f f^T
+    # the squared distance from x to the axis through c along f is |P (x - c)|^2 with P = 1 - f f^T
     projections = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     normal = projections.mean(axis=0)
     ahead = forward.mean(axis=0)

@@ -36,7 +36,7 @@ def test_every_training_flag_has_help(capsys: Capture) -> None:
     main(["train", "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for part in (
-        "--dssim-weight FLOAT Weight of D-SSIM",
+        "--dssim-weight FLOAT Weight w of D-SSIM",
         "--density.split-factor FLOAT Factor",
         "--eval-at STEP,STEP,",
     ):

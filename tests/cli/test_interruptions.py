@@ -182,8 +182,8 @@ def test_the_second_process_is_told_of_the_first(tmp_path: Path) -> None:
     with holder(tmp_path) as other, pytest.raises(InputError) as caught, locks.locked(tmp_path, "eval"):
         pass
     assert str(caught.value) == (
-        f"{tmp_path}: is being written by clsplat train (process {other.pid}); wait until that has ended, or choose "
-        "another folder"
+        f"{tmp_path}: is being written by clsplat train (process {other.pid}); wait until that process has ended, or "
+        "choose another folder"
     )
 
 

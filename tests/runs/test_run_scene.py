@@ -200,7 +200,9 @@ def foreign(run: Path, own: Path, tmp_path: Path) -> Path:
 
 def test_a_checkpoint_of_another_scene_is_refused(foreign: Path, scene: Path, capsys: Capture) -> None:
     line = refusal(foreign, scene, capsys)
-    named = f"{foreign / 'checkpoints' / 'step-0000003.npz'}: is from a training on another scene than {foreign}"
+    named = (
+        f"{foreign / 'checkpoints' / 'step-0000003.npz'}: is from a training on another scene than that of {foreign}"
+    )
     said = f"{named}, expected a checkpoint of this run; remove it, or go on from it with --accept-changes"
     assert said in line
     with pytest.raises(InputError, match="is from a training on another scene"):

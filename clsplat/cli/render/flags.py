@@ -74,14 +74,14 @@ class RenderVerb(Verb):
     """Render only these frames; all if not given. Ranges may have a step. Write --frames=-5-10 if it begins with a
     negative number."""
     usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
-    """Path or name of the camera, for a USD stage with several."""
+    """Path or name of the camera, for a USD stage with several cameras."""
     lenses: Annotated[Lenses | None, arg(metavar="undistort|native")] = None
     """Rendering of fisheye cameras of photographs. undistort: as the pinhole cameras that fit into them; native:
     through their own lens. If not given: as the run was trained. With --path, whose cameras are pinholes, and for a
     model without a run: undistort."""
     channels: Annotated[str, arg(metavar="NAME,...", help=_CHANNELS_HELP)] = "rgb"
     ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
-    """Property of the models' PLY files with an integer for each Gaussian, for --channels semantic."""
+    """Property of the models' PLY files that holds an integer id for each Gaussian, for --channels semantic."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians: black, white or three numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
@@ -103,10 +103,10 @@ class RenderVerb(Verb):
     quality: int = 95
     """Quality of JPEG files, from 1 to 100 (best)."""
     width: OptionalInt = None
-    """Width in pixels. If not given: from the height, or the camera's. If width and height change the camera's shape,
-    its vertical field of view is kept."""
+    """Width in pixels. If not given: follows from --height, else the camera's width. If width and height change the
+    camera's shape, its vertical field of view is kept."""
     height: OptionalInt = None
-    """Height in pixels. If not given: from the width, or the camera's."""
+    """Height in pixels. If not given: follows from --width, else the camera's height."""
     scale: float = 1.0
     """Factor on the camera's width and height, such as 0.5. It excludes --width and --height."""
     colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)
@@ -137,7 +137,8 @@ class RenderVerb(Verb):
     """auto: a bar on a terminal, and a line for each frame written. json: one object a line for each frame, on standard
     output, or on standard error with --json. openjd: progress messages for Open Job Description."""
     profile: Flag = False
-    """Measure the fraction of time in which the device works. With --json also the time on each frame."""
+    """Measure the fraction of time in which the device works. With --json, also report the device's time
+    for each frame."""
     device: Annotated[str | None, arg(metavar="DEVICE,...|all")] = None
     """OpenCL device: an index, cpu, gpu, or part of a name, as listed by `clsplat devices`. Several, separated by
     commas, share the frames. If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""

@@ -26,7 +26,7 @@ _EXTENSIONS_BY_FLAG = {
     "bits": (".png", ".tif", ".tiff", ".dpx"),
     "quality": (".jpg", ".jpeg"),
 }
-"""File endings on which each encoding flag has an effect."""
+"""For each encoding flag, the endings of the files on which it has an effect."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def checked(flags: RenderVerb) -> Request:
     Raises InputError, and DeviceError for a device that does not exist.
     """
     if flags.cameras is None:
-        check_around(flags.path, among_own=True)  # assume that the run has cameras: they are read later
+        check_around(flags.path, among_own=True)  # assume that the run has recorded cameras, which are read later
     channels = parse_channels(f"{flags.channels},alpha" if flags.alpha or flags.deep else flags.channels)
     check_format(flags.output, channels, video=True)
     flags.video.check()

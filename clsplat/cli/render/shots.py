@@ -34,7 +34,7 @@ picture 16384 pixels wide."""
 
 
 def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Return the shot of each eye by its name, with all frames; without stereo a single shot, under the name "".
+    """Return shots with all frames: one for each eye, keyed by "left" and "right"; without stereo one, keyed by "".
 
     models: function that loads the models. It is called for a path around the models, and for a single still camera,
       which shows every frame of a changing model.
@@ -47,7 +47,7 @@ def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str,
 
 
 def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Return the shot of --cameras or of --path by the eye's name. A still camera is a shot of a single frame."""
+    """Return shots like `shots_asked`, from --cameras or --path. A still camera becomes a shot of a single frame."""
     pairs, size = flags.pairs, (flags.width, flags.height)
     paths = _stage_cameras(pairs, flags.cameras, flags.usd_camera) if pairs.of_stage else {}
     if flags.cameras is None:
@@ -82,7 +82,7 @@ def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str |
 
 
 def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> dict[str, Shot]:
-    """Return the shot of each eye by its name; without stereo a single shot, under the name "".
+    """Return a shot for each eye, keyed by "left" and "right"; without stereo a single shot, keyed by "".
 
     shots: the shot of the cameras; with --stereo stage, the two shots of the eyes' cameras.
     paths: path of each eye's camera in the stage.
@@ -102,7 +102,9 @@ def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> 
 def with_stage(
     pictures: PictureConfig, source: object, shot: Shot, tasks: Sequence[Task]
 ) -> tuple[PictureConfig, tuple[str, ...]]:
-    """Return picture settings with a USD stage's data window, shutter and lens, and the stage settings not applied.
+    """Return picture settings with a USD stage's data window, shutter and lens.
+
+    The second result lists the names of the stage's settings that were not applied.
 
     source: the stage's file, for messages.
     shot: the shot read from the stage, with its data window.
@@ -125,7 +127,7 @@ def with_stage(
 
 
 def _pixel_aspect_unapplied(task: Task) -> tuple[str, ...]:
-    """Return a note on the stage's pixel aspect ratio if it is not 1 and the picture's format cannot store it."""
+    """Return a note on the stage's pixel aspect ratio if this is not 1 and the picture's format cannot store it."""
     shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
     if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
         return ()
@@ -160,7 +162,7 @@ def _framing(
 def _lens_unapplied(flags: SamplingConfig, tasks: Sequence[Task]) -> tuple[str, ...]:
     """Return a note on the stage's lens if no flag replaces this lens and the pictures lack its depth of field.
 
-    They lack it if the stage gives no focus distance, or if the camera is orthographic.
+    The pictures lack depth of field if the stage gives no focus distance, or if the camera is orthographic.
     """
     if flags.aperture is not None or flags.f_stop is not None:
         return ()

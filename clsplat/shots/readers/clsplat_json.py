@@ -39,8 +39,9 @@ KEY_FRAME_PROPERTIES = ("frame", "seconds", "position", "world_from_cam", *LENS_
 
 
 def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
-    """Read the frames of a camera file: those with whole numbers from the first key to the last, or, with
-    'loop_frames', one period from the first key. Cameras are interpolated smoothly between the keys (`interpolate`).
+    """Read the frames of a camera file. Cameras are interpolated smoothly between the keys (`interpolate`).
+
+    Frames have whole numbers from the first key to the last, or, with 'loop_frames', for one period from the first key.
 
     document: the file's parsed JSON object.
 

@@ -41,12 +41,12 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
     interpolation between samples. `Shot.unapplied` names authored settings that are not applied. USD's warnings become
     the shot's warnings.
 
-    size: width and height in pixels. A missing side follows from the resolution of the render settings, or without one
-      from the first frame's aperture. If both sides are missing, the size is that resolution.
-    prim: path or name of the camera, needed if the stage has several and its render settings name none.
+    size: width and height in pixels. A missing side follows from the resolution of the render settings, else from
+      the first frame's aperture. If both sides are missing, the size is that resolution.
+    prim: path or name of the camera, needed if the stage has several cameras and its render settings name none.
     The render settings also give the pixel aspect ratio and how the aperture is conformed to the size. Without them,
-    the aperture's width fills the picture's, and pixels are square. Raises InputError if the stage cannot be opened,
-    has no such camera, no size or invalid values, or if usd-core is not installed.
+    the aperture's width fills the picture's width, and pixels are square. Raises InputError if the stage cannot be
+    opened, has no such camera, no size or invalid values, or if usd-core is not installed.
     """
     survive(path, "clsplat.shots.readers.usd:read_here", size=size, prim=prim)
     return read_here(path, size, prim)
@@ -56,7 +56,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     """Read cameras like `read_usd`, from a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
-    # captures the messages that USD would print, as on a missing layer, which may not concern the camera
+    # captures the messages that USD would print. They may not concern the camera, as for a missing layer.
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     stage = open_stage(path, path)
     with readable(path):
@@ -141,7 +141,10 @@ def _optics(where: str, camera: Any, code: int, settings: Settings, metres: floa
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
-    """Return the name and first value of an attribute that is authored and differs from `usual`; otherwise ''."""
+    """Return the name and first unusual value of an authored attribute; '' if it has no unusual value.
+
+    usual: the value that changes no picture. codes: time codes of the frames.
+    """
     attribute = prim.GetAttribute(name)
     if not attribute or not attribute.HasAuthoredValue():
         return ""
@@ -180,7 +183,7 @@ def _moved(camera: Any) -> Iterator[Any]:
 def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
     """Return the whole time codes to render, and all times at which the camera or an ancestor's transform has a value.
 
-    The time codes are the stage's range. If it has none, they go from the first time with a value to the last. Each
+    The time codes are the stage's range. Without a range, they go from the first time with a value to the last. Each
     value is read once, so that an error is raised now if USD cannot read it.
     """
     attributes = camera.GetPrim().GetAttributes()

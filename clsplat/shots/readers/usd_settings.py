@@ -29,7 +29,7 @@ class Settings:
     window: left, bottom, right and top of the pixels to render, as fractions of the frame from its lower left corner.
     instantaneous: True if the shutter closes at the time at which it opens.
     unapplied: names of authored settings that are not applied.
-    A stage without render settings has the defaults: the aperture's width fills the picture's.
+    A stage without render settings has the defaults: the aperture's width fills the picture's width.
     """
 
     resolution: tuple[int, int] | None = None
@@ -75,7 +75,7 @@ def window_named(window: tuple[float, float, float, float] | None) -> tuple[str,
 
 
 def camera_of_settings(stage: Any) -> str:
-    """Return the path of the camera that a render product or else the stage's render settings name; '' if none do."""
+    """Return the camera's path that a render product gives, or else the stage's render settings; '' if neither does."""
     settings = _stage_settings(stage)
     for prim in (*_products(settings), settings) if settings else ():
         if targets := prim.GetCameraRel().GetForwardedTargets():
