@@ -47,8 +47,8 @@ static inline void order_two(Pair *one, Pair *other) {
 // second step compares pairs that are step / 2 apart. An item does both steps for four pairs in registers; these may
 // lie past `count`, up to the next power of two.
 //
-// If `step` is 1, the function still takes two steps, and the first is redundant. It repeats an earlier step, or comes
-// before all others, when any exchange is allowed.
+// If `step` is 1, the function still takes two steps, and the first is redundant. It repeats an earlier step, or it is
+// the first step of the sort, before which the pairs may be in any order.
 static inline void order_steps(__local Pair *pairs, uint count, uint step, int mirrored) {
   const uint apart = max(step / 2, 1u), within = apart - 1;
   const uint near = PLACE(apart), far = PLACE(mirrored ? 3 * apart - 1 : 2 * apart), turned = mirrored ? near : 0;
@@ -216,7 +216,7 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
   for (uint k = begin; k < end_of_tiles; ++k) order[atomic_inc(places + clz(ranges[2 * k + 1] - ranges[2 * k]))] = k;
 }
 
-// Appends a pair of the Gaussian's `depth` to the list of `tile`.
+// Appends a pair, made of `slot` and the local variable `depth`, to the list of `tile`. gaussian: its Gaussian's index.
 #define APPEND(tile, slot, gaussian)                                                                                   \
   {                                                                                                                    \
     pairs[atomic_inc(cursors + (tile))] = (Pair)(slot, depth);                                                         \

@@ -119,8 +119,10 @@ def plan_step(
 
 
 def plan_view(device: Device, made: Plan, in_view: int) -> Plan:
-    """Return a plan like `made`, of steps over the chunks in view, with memory for views of up to `in_view` rows.
-    Raises CapacityError."""
+    """Plan steps over the chunks in view again, with memory for views of up to `in_view` rows. Raises CapacityError.
+
+    made: the previous plan of these steps.
+    """
     return plan_by_chunk(replace(made.need, in_view=in_view), made.allowed, device.max_allocation)
 
 

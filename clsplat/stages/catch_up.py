@@ -24,13 +24,13 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
 
 _TABLE_NUMBERS = 2 + len(PARAMETER_GROUPS)
-"""Number of columns of a step table (`step_numbers`): two factors of Adam, then a rate for each parameter group."""
+"""Number of columns of a step table (`step_numbers`): two roots, then a learning rate for each parameter group."""
 _ABREAST = 4
 """Number of elements that a work-item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
 
 
 def step_table(steps: Iterable[AdamStep]) -> Float32:
-    """Return the table (steps, _TABLE_NUMBERS) for `catch_up`: for each step, the factors of Adam and the rates."""
+    """Return the table (steps, _TABLE_NUMBERS) for `catch_up`: the `step_numbers` of each step, without penalties."""
     return np.array([step_numbers(step, NO_EXPLORATION) for step in steps], np.float32).reshape(-1, _TABLE_NUMBERS)
 
 

@@ -98,7 +98,7 @@ class ChunkPool:
     def resize(self, rows: int) -> None:
         """Replace the slots by empty slots for `rows` Gaussians, after writing changed chunks back. Raises WriteError.
 
-        If the driver has no memory for them, although the plan has, one slot is allocated.
+        If the driver cannot allocate them, although they are within the memory plan, a single slot is allocated.
         """
         self.release()
         self.free()
@@ -157,7 +157,8 @@ class ChunkPool:
     def place_rows(self, start: int, stop: int) -> None:
         """Copy the rows [start, stop) of the model to the first rows of the pool. They need not be whole chunks.
 
-        So only `keep_rows` can write changes of these rows back. Raises WriteError and ScratchError.
+        So the pool does not know the rows as chunks, and only `keep_rows` can write changes of them back. Raises
+        WriteError and ScratchError.
         """
         self.release()
         for begin, end, slots in self._row_groups(start, stop):
@@ -252,7 +253,7 @@ class ChunkPool:
         return values.view(self.store.record).reshape(-1)
 
     def _groups(self, count: int) -> list[slice]:
-        """Return slices of `count` chunks, which cross the bus one after the other (`residency.CROSSING_SHARE`)."""
+        """Divide `count` chunks into slices that cross the bus one after the other (`residency.CROSSING_SHARE`)."""
         most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
         return [slice(begin, begin + most) for begin in range(0, count, most)]
 

@@ -26,8 +26,8 @@ slightly past the last pair."""
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
-"""Bytes per Gaussian: its entries of `first_slots`, `gaussian_from_visible` and `depth_keys`, of the sort by depth, and
-of `gaussian_from_rank`, `rank_counts` and `offsets`."""
+"""Bytes per Gaussian: an entry each in `first_slots`, `gaussian_from_visible`, `depth_keys`, `gaussian_from_rank`,
+`rank_counts` and `offsets`, and the Gaussian's share of the sort by depth."""
 BAND_GAUSSIAN_BYTES = 4
 """Additional bytes per Gaussian if there are several bands: the number of the Gaussian's tiles in the band."""
 BAND_TILE_BYTES = 4

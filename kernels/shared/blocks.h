@@ -186,16 +186,16 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
 }
 
 // An entry of a list: the pair's number in its batch, with the bit DENSE if the pair reaches more than half of the
-// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE minus the number
-// of reached blocks, negative for DENSE.
+// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE, the largest
+// number of reached blocks without DENSE, minus the number of reached blocks.
 #define DENSE 0x80000000u
 #define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))
 #define SPARSE(own) (ALL_REACHED ? (own) : (own) / 2)
 #define IS_DENSE(entry, own) (SPARSE(own) == 0 || (SPARSE(own) < (own) && ((entry) & DENSE)))
 
-// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, a bit for each pair. The top byte of each product has the
-// marks of four pairs.
+// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, a bit for each pair. A multiplication collects the marks
+// of four pairs in the top byte of the product.
 static inline uint marked_from(__local const uint *marks, int begin) {
   uint marked = 0;
   _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
