@@ -84,8 +84,8 @@ static inline void order_step_far(__global Pair *list, uint count, uint step, in
   BARRIER_GLOBAL();
 }
 
-// Copies `list` (count) to `pairs` in local memory, and fills `pairs` with NO_PAIR up to `whole`. An item reads only
-// the elements that it also writes in store_pairs, because the barriers in between do not order global memory.
+// Copies `list` (count) to `pairs` (whole) in local memory, and fills the rest of `pairs` with NO_PAIR. An item reads
+// only the elements that it also writes in store_pairs, because the barriers in between do not order global memory.
 static inline void fetch_pairs(__global const Pair *list, uint count, uint whole, __local Pair *pairs) {
   for (uint k = get_local_id(0); k < whole; k += AHEAD * ITEMS) {
     Pair ahead[AHEAD];

@@ -152,7 +152,7 @@ class DeviceArray:
         self._write(values, start)
 
     def _read(self, host: NDArray[Any], start: int) -> None:
-        """Copy the rows from `start` on to `host`, as many as it has rows, and wait for the device."""
+        """Fill the host array `host` with this array's rows from `start` on, and wait for the device."""
         if host.size:
             self.device.calls.blocking_reads += 1
             event = self._copied(_READING, host, self.buffer, src_offset=self._at(start), is_blocking=True)

@@ -111,7 +111,7 @@ def plan_step(
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
         statistics=statistics,
-        held=0 if step.by_chunk else None,  # 0, as bounds and lists of chunks are in main memory
+        held=0 if step.by_chunk else None,  # bounds and lists of chunks take no device memory: they are in main memory
         pool=step.pool,
         in_view=step.in_view,
     )

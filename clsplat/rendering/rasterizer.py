@@ -246,7 +246,7 @@ class Rasterizer:
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
             listed, one = None, len(bands) == 1
             for band in bands:
-                del listed  # frees memory, which this band may need for larger arrays
+                del listed  # frees the last band's memory, which this band may need
                 listed = self._list(device, projected, band, tiles_of(camera), counted if one else None)
                 blended = blend(device, work, listed.lists, inputs, record=records and one, nearness=nearness)
             assert listed is not None, "an image has at least one tile"

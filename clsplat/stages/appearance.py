@@ -185,7 +185,7 @@ def step_gains(
     """Update the colour entries `gains` in place by Adam.
 
     photograph: the photograph or lens of the view, a row of `gains`. All other rows have a gradient of 0.
-    columns: the gradient of this row, summed over each pixel column (`entry_gradient`).
+    columns: the result of `entry_gradient`, which contains the gradient with respect to this row.
     step: the number of this update, from 1.
     readback: counts of the step's pass (`READBACK`). Nothing changes if the pass has stopped (kernels/duplicate.cl).
     """

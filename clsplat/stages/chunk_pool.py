@@ -309,7 +309,7 @@ class StoredArray:
         self.pool.store.set_at(self.field, places, values)
 
     def change(self, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-        """Replace the rows of each chunk by the result of the function `change` for them."""
+        """Replace the rows of each chunk by the array that the function `change` returns for these rows."""
         self.pool.release()
         self.pool.store.change(self.field, change)
 

@@ -31,7 +31,7 @@ class UploadedCameras:
 
 
 def upload_cameras(device: Device, cameras: Sequence[Camera]) -> list[UploadedCameras]:
-    """Upload the cameras, grouped by model."""
+    """Upload cameras, grouped by camera model."""
     packs: dict[CameraModel, list[NDArray[np.float32]]] = {}
     for camera in cameras:
         packs.setdefault(camera.model, []).append(pack_camera(camera))

@@ -7,7 +7,7 @@
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// Least determinant of the covariance without the low-pass for which the compensation has a gradient.
+// The compensation has no gradient if the determinant of the covariance without the low-pass is this or less.
 #define LEAST_DETERMINANT 1e-30f
 
 typedef struct {
