@@ -153,8 +153,8 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
 }
 
 // Computes where each tile's list begins. counts (tiles + 1), sums (groups) of count_tiles -> counts: the index at
-// which each list begins; sums: their exclusive scan; ranges (tiles, 2); order (tiles): the tiles sorted by floor(log2)
-// of their lists' lengths, longest first, because these take longest to sort.
+// which each list begins; sums: the exclusive scan of `sums`; ranges (tiles, 2); order (tiles): the tiles sorted by
+// floor(log2) of their lists' lengths, longest first, because these take longest to sort.
 //
 // readback gets the same entries as from compact_visible in duplicate.cl, except that the two entries for keys are 0,
 // and in addition the length of the longest list. A pass stops under the conditions that the comment of compact_visible

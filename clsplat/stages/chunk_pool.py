@@ -258,7 +258,7 @@ class ChunkPool:
         return [slice(begin, begin + most) for begin in range(0, count, most)]
 
     def _crossing(self, slots: NDArray[np.uint32]) -> tuple[DeviceArray, DeviceArray]:
-        """Upload slots (k,), and return them with device memory for their records."""
+        """Upload the numbers of k slots. Returns the numbers on the device, and device memory for k records."""
         on_device = self._work.array("crossing_slots", slots.shape, np.uint32)
         on_device.set(slots)
         return on_device, self._work.array("crossing", (len(slots), self.store.record.itemsize // 4), np.uint32)

@@ -110,7 +110,7 @@ class DensityStatistics:
         return self.of({name: array.in_pool for name, array in self.named().items()}, of_slots=True)
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
-        """Return the statistics on the device of the Gaussians [start, stop), in a pool from its first slots."""
+        """Return the statistics of the Gaussians [start, stop) on the device. In a pool they are in the first rows."""
         start, stop = (0, stop - start) if self.of_slots else (start, stop)
         if (start, stop) == (0, self.seen.shape[0]):
             return self
@@ -123,7 +123,7 @@ class DensityStatistics:
         return {name: array for name in names if (array := getattr(self, name)) is not None}
 
     def by_field(self) -> dict[str, Any]:
-        """Return the arrays by their names in a checkpoint and in a store of chunks."""
+        """Return the arrays by their names in checkpoints and stores of chunks (such as "statistics/radii")."""
         return {f"{KIND}/{name}": array for name, array in self.named().items()}
 
     def load(self, values: Mapping[str, Float32]) -> None:

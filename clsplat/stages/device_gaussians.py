@@ -84,7 +84,7 @@ class HostArray:
         return self.values.shape
 
     def get(self) -> NDArray[Any]:
-        """Return a copy of the array."""
+        """Return a copy of this array."""
         return self.values.copy()
 
     def set(self, values: NDArray[Any]) -> None:
@@ -199,7 +199,7 @@ def parts(
 
 
 def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, stop: int) -> DeviceGaussians:
-    """Upload the rows [start, stop) of a model in main memory, to arrays of the workspace named by `index`."""
+    """Upload the rows [start, stop) of model number `index` from main memory to arrays of the workspace."""
     arrays = {}
     for name, whole in model.arrays.items():
         values = whole.values[start:stop]

@@ -213,7 +213,8 @@ static inline uint marked_from(__local const uint *marks, int begin) {
     count += popcount(marked);                                                                                         \
   }
 
-// Defines the same variables for a splat `s` in local memory (Staged) as SPLAT_HERE for a splat in global memory.
+// Defines position, whitening, opacity and colour of a splat as variables, from the splat `s` in local memory (Staged).
+// SPLAT_HERE defines all but the colour, from a splat in global memory.
 #define SPLAT_STAGED(s)                                                                                                \
   __global const float *splat = splats + (size_t)SPLAT_SIZE * s.kept;                                                  \
   const float mx = s.mx, my = s.my, l11 = s.l11, l12 = s.l12, l22 = s.l22, log2o = s.log2o;                            \
