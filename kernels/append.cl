@@ -47,8 +47,8 @@ static inline void order_two(Pair *one, Pair *other) {
 // second step compares pairs that are step / 2 apart. An item does both steps for four pairs in registers; these may
 // lie past `count`, up to the next power of two.
 //
-// If `step` is 1, the function still takes two steps, and the first is redundant. It repeats an earlier step, or comes
-// before all others, when any exchange is allowed.
+// If `step` is 1, the function still takes two steps, and the first is redundant. It repeats an earlier step, or it is
+// the first step of the sort, before which the pairs may be in any order.
 static inline void order_steps(__local Pair *pairs, uint count, uint step, int mirrored) {
   const uint apart = max(step / 2, 1u), within = apart - 1;
   const uint near = PLACE(apart), far = PLACE(mirrored ? 3 * apart - 1 : 2 * apart), turned = mirrored ? near : 0;
@@ -84,8 +84,8 @@ static inline void order_step_far(__global Pair *list, uint count, uint step, in
   BARRIER_GLOBAL();
 }
 
-// Copies `list` (count) to `pairs` in local memory, and fills `pairs` with NO_PAIR up to `whole`. An item reads only
-// the elements that it also writes in store_pairs, because the barriers in between do not order global memory.
+// Copies `list` (count) to `pairs` (whole) in local memory, and fills the rest of `pairs` with NO_PAIR. An item reads
+// only the elements that it also writes in store_pairs, because the barriers in between do not order global memory.
 static inline void fetch_pairs(__global const Pair *list, uint count, uint whole, __local Pair *pairs) {
   for (uint k = get_local_id(0); k < whole; k += AHEAD * ITEMS) {
     Pair ahead[AHEAD];
@@ -153,8 +153,8 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
 }
 
 // Computes where each tile's list begins. counts (tiles + 1), sums (groups) of count_tiles -> counts: the index at
-// which each list begins; sums: their exclusive scan; ranges (tiles, 2); order (tiles): the tiles sorted by floor(log2)
-// of their lists' lengths, longest first, because these take longest to sort.
+// which each list begins; sums: the exclusive scan of `sums`; ranges (tiles, 2); order (tiles): the tiles sorted by
+// floor(log2) of their lists' lengths, longest first, because these take longest to sort.
 //
 // readback gets the same entries as from compact_visible in duplicate.cl, except that the two entries for keys are 0,
 // and in addition the length of the longest list. A pass stops under the conditions that the comment of compact_visible
@@ -216,7 +216,7 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
   for (uint k = begin; k < end_of_tiles; ++k) order[atomic_inc(places + clz(ranges[2 * k + 1] - ranges[2 * k]))] = k;
 }
 
-// Appends a pair of the Gaussian's `depth` to the list of `tile`.
+// Appends a pair, made of `slot` and the local variable `depth`, to the list of `tile`. gaussian: its Gaussian's index.
 #define APPEND(tile, slot, gaussian)                                                                                   \
   {                                                                                                                    \
     pairs[atomic_inc(cursors + (tile))] = (Pair)(slot, depth);                                                         \

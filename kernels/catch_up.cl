@@ -143,7 +143,7 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
   const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - taken;
   __global const float *from = table + (size_t)TABLE_NUMBERS * (taken + 1 - first_step);
 #if LANES > 1
-  // One array of the model after another, so that accesses run long enough for the processor's prefetcher.
+  // Updates one array of the model after another, so that accesses run long enough for the processor's prefetcher.
   const uint first = ROWS * piece;
   if (first >= rows) return;
   const uint end = min(first + ROWS, rows);

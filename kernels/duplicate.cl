@@ -14,7 +14,8 @@
 #include "shared/tile.h"
 #include "shared/prefetch.h"
 
-// tile_span (shared/tile.h), restricted to the band of tiles [first_tile, end_tile) in row-major order.
+// The tiles [*x0, *x1) of tile row ty that the ellipse reaches (tile_span in shared/tile.h), if they are in the band of
+// tiles [first_tile, end_tile) in row-major order.
 static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, int first_tile, int end_tile, int *x0,
                              int *x1) {
   tile_span(e, ty, part, tiles_x, x0, x1);

@@ -64,8 +64,8 @@ __kernel void slice(const int photograph, const int stride, const int plane, con
         fma1(map[4 * c], r, fma1(map[4 * c + 1], g, fma1(map[4 * c + 2], b, map[4 * c + 3])));
 }
 
-// Turns the gradient with respect to `seen` into the gradient with respect to `image`: grids, image -> gradient, in
-// place.
+// Turns the gradient with respect to the transformed colours into the gradient with respect to `image`, the colours
+// before the transform: grids, image -> gradient, in place.
 __kernel void slice_gradient(const int photograph, const int stride, const int plane, const float across,
                              const float down, __global const float *grids, __global const float *image,
                              __global float *gradient) {
@@ -91,8 +91,9 @@ __kernel void slice_gradient(const int photograph, const int stride, const int p
   gradient[2 * (size_t)plane + at] = fma1(0.114f, by_luminance, by_blue);
 }
 
-// Sums the gradient over the pixels of an image line, with the interpolation weights of grid column and level: image,
-// gradient with respect to `seen` -> lines.
+// Sums the gradient with respect to the grid over the pixels of an image line, with the interpolation weights of grid
+// column and level. image: the colours before the transform; gradient: with respect to the transformed colours ->
+// lines.
 __kernel void line_sums(const int width, const int stride, const int plane, const float across,
                         __global const float *image, __global const float *gradient, __global float *lines) {
   const int i = get_global_id(0), y = get_global_id(1), c = get_global_id(2);

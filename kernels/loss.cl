@@ -228,7 +228,8 @@ static inline float2 differences(const Block block, const int y, const float l1_
 }
 
 // Computes the loss and its gradient in one launch: image, target -> gradient, sums. A block has block_rows x columns
-// pixels, and at most LOSS_COLUMNS columns. field: as in Block, at least columns + 2 * MARGIN.
+// pixels, and at most LOSS_COLUMNS columns. field: the floats between the derivatives of a row in `partials`, at least
+// columns + 2 * MARGIN.
 GROUP __kernel void loss(const int width, const int height, const int stride, const int plane, const int columns,
                          const int block_rows, const int field, const float l1_scale, const float ssim_scale,
                          __global const float *image, __global const float *target, __global float *partials,

@@ -46,8 +46,8 @@ GROUP __kernel void limit_blend(const int rounds, __global const float *splats, 
   sums[get_global_id(0)] = sum;
 }
 
-// The arithmetic of the gradient of blending without branches, measured like limit_blend: alpha, transmittance by
-// division, nine sums.
+// The arithmetic of the gradient of blending without branches. For each of rounds * OWNED * LANES pairs of a Gaussian
+// and a pixel, an item computes alpha, recovers the transmittance by division, and adds to the nine sums of a slot.
 GROUP __kernel void limit_blend_grad(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {

@@ -88,7 +88,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
                  camera[CAMERA_CX_LOW], camera[CAMERA_WINDOW_X], &field[SPLAT_PIXEL_X].all, &field[SPLAT_SUB_X].all);
   image_position(p.y, p.ly, p.z, p.lz, camera[CAMERA_FY], camera[CAMERA_FY_LOW], camera[CAMERA_CY],
                  camera[CAMERA_CY_LOW], camera[CAMERA_WINDOW_Y], &field[SPLAT_PIXEL_Y].all, &field[SPLAT_SUB_Y].all);
-  // Equations (8), (44) of docs/gradients.md: Sigma^-1 = W^T W with W upper triangular, stored as WHITEN W.
+  // Equations (8), (44) of docs/gradients.md: Sigma^-1 = W^T W with W upper triangular. Stores WHITEN W.
   const floatL l11 = WHITEN * sqrt(p.syy / p.det);
   const floatL log2o = log2L(opacity);
   const floatL budget = (floatL)(EXTENT(log2o));

@@ -25,7 +25,7 @@
 // Slack in pixels by which a box is enlarged, in addition to TILE_SLACK: it covers the rounding of float32 angles in a
 // picture 32768 pixels wide.
 #define BOX_SLACK 0.1f
-// Stores the tiles of a box in the form that `ellipse_of` reads.
+// Stores in a splat which tiles a box covers. tile.h reads them again (`ellipse_of`).
 static inline void store_box(const Box *t, int width, int height, int tiles_x, int tiles_y, __constant float *camera,
                              __global float *splat) {
   int x0 = 0, x1 = tiles_x;

@@ -13,7 +13,8 @@
 // Equations: docs/gradients.md, (190) to (192).
 #include "shared/math.h"
 
-// Factors of a parameter group: for m / (sqrt(v) + epsilon), for the first moment m, for the second moment v.
+// Number of factors of a parameter group, one each for m / (sqrt(v) + epsilon), for the first moment m and for the
+// second moment v.
 #define FACTORS 3
 #define GROUPS 6
 

@@ -56,20 +56,21 @@ class DeviceArray:
         return self.size * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
-        """Return a copy on the host; wait for the device."""
+        """Return a copy of this array on the host. Waits for the device."""
         host = np.empty(self.shape, self.dtype)
         self.read_into(host)
         return host
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy `values` from the host, and wait for the device. Raises ValueError if the shape or dtype differs."""
+        """Copy the host array `values` to this array, and wait. Raises ValueError if the shape or dtype differs."""
         self._check(values)
         self._write(values, 0)
 
     def send(self, values: NDArray[Any]) -> None:
-        """Copy `values` from the host without waiting. They must not change until the host has waited for the device.
+        """Copy the host array `values` to this array without waiting.
 
-        Raises ValueError if the shape or dtype differs, or the array is not C-contiguous.
+        `values` must not change until the host has waited for the device. Raises ValueError if its shape or
+        dtype differs, or it is not C-contiguous.
         """
         self._check(values)
         if values.size:
@@ -147,11 +148,11 @@ class DeviceArray:
         return host
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
-        """Copy `values` from the host to the rows from `start` on, and wait. `start` needs no alignment."""
+        """Copy the host array `values` to the rows from `start` on, and wait. `start` needs no alignment."""
         self._write(values, start)
 
     def _read(self, host: NDArray[Any], start: int) -> None:
-        """Copy the rows from `start` on to `host`, as many as it has rows, and wait for the device."""
+        """Fill the host array `host` with this array's rows from `start` on, and wait for the device."""
         if host.size:
             self.device.calls.blocking_reads += 1
             event = self._copied(_READING, host, self.buffer, src_offset=self._at(start), is_blocking=True)

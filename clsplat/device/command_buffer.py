@@ -51,7 +51,7 @@ def typed(value: Any) -> Any:
 
 
 def described(value: Any) -> object:
-    """Return an object for comparison of kernel arguments, which is equal for two arguments of equal value."""
+    """Return an object by which kernel arguments are compared: two arguments with the same value give equal objects."""
     value = typed(value)
     if isinstance(value, cl.MemoryObjectHolder):
         return value.int_ptr

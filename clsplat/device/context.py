@@ -136,7 +136,7 @@ class Device:
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
-                self._fma.append(self._probe_fma())  # changed in place, as copies of this device share the list
+                self._fma.append(self._probe_fma())  # the list is changed in place, as copies of this device share it
             kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines}, registers)
         return kernels
 
@@ -336,7 +336,7 @@ class Device:
             except (KernelBuildError, DriverError):
                 continue
             if np.array_equal(got, wanted):
-                self._subgroups.append(defines)  # changed in place, as copies of this device share the list
+                self._subgroups.append(defines)  # the list is changed in place, as copies of this device share it
                 return defines
         raise DeviceError(
             f"{title(self.cl_device)}: the work-items of a sub-group got wrong values from each other; choose a shape "

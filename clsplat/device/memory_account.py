@@ -11,7 +11,7 @@ from clsplat.errors import CapacityError, amount
 
 
 class Memory:
-    """The account of one device's buffers: bytes `used` now, the `peak` of `used`, and its `limit` or None."""
+    """The account of one device's buffers in bytes: `used` now, `peak` (the maximum of `used`), and `limit` or None."""
 
     def __init__(self, limit: int | None = None) -> None:
         self.limit = limit

@@ -177,7 +177,7 @@ class KernelTrials:
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
             error = self.fail(variant, kernel, trouble, trial, lasting=answer.get("lasting", True))
-            self._failed[name] = str(error)  # kept, so that this process does not repeat the trial
+            self._failed[name] = str(error)  # the error is kept, so that this process does not repeat the trial
             raise error
         self.known[name] = str(answer.get("salt", ""))
         if "salt" in answer:  # no salt means that the compiler has refused the text, as it will in this process

@@ -196,7 +196,9 @@ def _set_shape_gradients(
 ) -> None:
     """Set the gradients of a Gaussian's mean, conic and opacity: eqs. (25) to (29).
 
-    splat: the Gaussian's footprint. d_alpha, alpha: (h, w), gradient with respect to its alpha, and alpha, on its box.
+    splat: the Gaussian's footprint on a box of h x w pixels.
+    alpha: (h, w), the Gaussian's alpha at these pixels.
+    d_alpha: (h, w), the gradient with respect to `alpha`.
     """
     g = d_alpha * alpha
     dx, dy = splat.dx, splat.dy

@@ -18,7 +18,8 @@ from clsplat.reference.blend import Layer, layers
 from clsplat.reference.project import ProjectedTwin
 
 SLACKS_PER_WALK = 8
-"""Number of intervals of the coarse search for a pixel's `Deep.slack`, and of the fine search in one of them."""
+"""A pixel's `Deep.slack` is found by two searches: a coarse one in this many intervals, then a fine one in this many
+parts of one interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,10 @@ class _Cut:
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """Return True for the pixels of the layer's box in which it begins a new slice. may: mask of allowed pixels."""
+        """Add a layer. Returns True for the pixels of its box in which the layer begins a new slice.
+
+        may: mask of the pixels of the box in which a slice may begin.
+        """
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack

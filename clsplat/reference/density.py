@@ -16,7 +16,9 @@ from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS, MarkRul
 
 
 def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
-    """Return scores (n,): the mean gradient norm of Gaussians that may be densified; UNWANTED or USELESS for others.
+    """Return a score (n,) of each Gaussian: its mean gradient norm if it may be densified, otherwise UNWANTED.
+
+    A Gaussian whose largest contribution to a view is at most `rules.contribution` gets USELESS instead.
 
     statistics: the statistics of density control, arrays (n,) by their names in a checkpoint.
     """

@@ -231,7 +231,8 @@ def project(
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
     """Return a fisheye's gradients with respect to points (N, 3) in the camera's axes and to focal lengths (2,).
 
-    The second includes only the part through the means on the image, not the part through the Jacobians.
+    The gradient with respect to focal lengths is only the part through the means on the image, without the part through
+    the Jacobians.
 
     d_means2d: (N, 2), the gradient with respect to the means on the image.
     d_j: (N, 2, 3), the gradient with respect to the Jacobians.
@@ -263,7 +264,8 @@ def _pinhole_grad(
 ) -> tuple[Float64, Float64, Float64]:
     """Return a pinhole camera's gradients with respect to points (N, 3), focal lengths (2,) and principal point (2,).
 
-    The last is only the part through means that are clamped in the Jacobian, with the sign reversed.
+    The gradient with respect to the principal point is only the part through means that are clamped in the Jacobian,
+    with the sign reversed.
 
     points, jacobians, clamped: rows of `EwaProjectedTwin`.
     d_means2d, d_j: gradients (N, 2) and (N, 2, 3) with respect to the means on the image and the Jacobians.

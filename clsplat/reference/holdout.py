@@ -19,7 +19,7 @@ Surface = tuple[Float64, Float64, Float64]
 
 
 def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
-    """Return the fraction (H, W) of light from this depth that passes all surfaces in front of it: eq. (75)."""
+    """Return the fraction (H, W) of light from `depth` that passes all surfaces in front of it: eq. (75)."""
     left = np.ones(surfaces[0][0].shape)
     for begin, end, alpha in surfaces:
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -40,7 +40,10 @@ def blur(image: Float64) -> Float64:
 
 
 def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """Return the SSIM map (H, W, C) and the gradient, with respect to x, of its sum: eqs. (17), (18), (20), (21)."""
+    """Return the SSIM map (H, W, C) of two images x and y, and the gradient of the map's sum with respect to x.
+
+    Equations (17), (18), (20) and (21).
+    """
     mean_x, mean_y = blur(x), blur(y)
     var_x = blur(x * x) - mean_x**2
     var_y = blur(y * y) - mean_y**2
@@ -84,7 +87,10 @@ def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2
 def alpha_loss(transmittance: Float64, alpha: Float64, counts: Float64, weight: float) -> tuple[float, Float64]:
     """Return the alpha loss and its gradient with respect to transmittance: eq. (81). Arrays are (H, W).
 
-    The loss is weight * mean |1 - transmittance - alpha|, over the pixels where `counts` is 1 and not 0.
+    The loss is weight * mean |1 - transmittance - alpha|, over some pixels only.
+
+    alpha: the photograph's alpha.
+    counts: 1 for the pixels over which the mean is taken, 0 for the others.
     """
     difference = counts * (1 - transmittance - alpha)
     scale = weight / max(counts.sum(), 1)

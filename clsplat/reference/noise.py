@@ -18,7 +18,7 @@ HALF_WORDS_PER_NORMAL = 8
 
 
 def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Hash 32-bit words to pseudorandom words, different words to different ones, as in kernels/shared/random.h."""
+    """Hash 32-bit words, as in kernels/shared/random.h. Different words get different hashes."""
     words = (words ^ (words >> np.uint32(16))) * np.uint32(0x7FEB352D)
     words = (words ^ (words >> np.uint32(15))) * np.uint32(0x846CA68B)
     return words ^ (words >> np.uint32(16))
@@ -38,7 +38,10 @@ def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
 def displacements(
     explore: Exploration, quaternions: Float64, log_scales: Float64, opacity_logits: Float64, first_row: int = 0
 ) -> Float64:
-    """Return the random displacements (n, 3) of the means of n consecutive rows: eq. (92). first_row: the first row."""
+    """Return the random displacements (n, 3) of the means of n consecutive rows: eq. (92).
+
+    first_row: number of the first of these rows in the model.
+    """
     eta = normal_numbers(explore.key, first_row + np.arange(len(opacity_logits)))
     opacities = 1 / (1 + np.exp(-opacity_logits))
     weights = explore.amount / (1 + np.exp(100 * (opacities - explore.dead)))

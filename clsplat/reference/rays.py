@@ -66,7 +66,10 @@ class Tangents(Seen):
         return np.array([a, b, c])
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Return what `Seen.by_mean` returns, for a tangent plane that rotates with the mean: eq. (21)."""
+        """Return derivatives of -q / 2 at each pixel of a footprint with respect to the mean's x and y: eq. (21).
+
+        The coordinates x and y are on the tangent plane, which rotates with the mean.
+        """
         by_x, by_y = super().by_mean(gaussian, splat)
         q = splat.dx * by_x + splat.dy * by_y
         return by_x + q * splat.dx, by_y + q * splat.dy

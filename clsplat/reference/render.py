@@ -116,7 +116,7 @@ def render_grad(
 
 
 def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> ProjectedGradients:
-    """Convert the gradients of blending to the input of `project_grad`: conics become covariances."""
+    """Convert the gradients of blending to the input of `project_grad`, with covariances in place of conics."""
     by_covariance = covariance_grad(projected.conics, screen.conics)
     return ProjectedGradients(screen.means2d, by_covariance, screen.opacities, screen.colors)
 

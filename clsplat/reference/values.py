@@ -17,7 +17,7 @@ from clsplat.reference.blend import BLEND_ALPHA_MAX, TRANSMITTANCE_MIN
 from clsplat.reference.project import ALPHA_MIN
 
 MAX_VALUES_MARGIN = 0.05
-"""Upper limit of `ValuesBlended.margin`."""
+"""Upper limit of `ValuesBlended.margin`, the relative distance of an alpha or a transmittance from a threshold."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ def largest_contributions(
 ) -> Float32:
     """Each Gaussian's largest contribution (n,) to the image of any of the cameras, in pixels.
 
-    A contribution is the sum over the image's pixels of alpha times transmittance, like `--density.min-contribution`.
+    A contribution is the sum over the image's pixels of alpha times transmittance, as in `--density.min-contribution`.
     It is 0 if the camera does not see the Gaussian. The kernel blend_grad computes contributions, whatever the
     gradient of the image is. Raises CapacityError if the device's memory is too small.
     """

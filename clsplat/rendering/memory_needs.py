@@ -111,7 +111,7 @@ def plan_step(
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
         statistics=statistics,
-        held=0 if step.by_chunk else None,  # 0, as bounds and lists of chunks are in main memory
+        held=0 if step.by_chunk else None,  # bounds and lists of chunks take no device memory: they are in main memory
         pool=step.pool,
         in_view=step.in_view,
     )
@@ -119,8 +119,10 @@ def plan_step(
 
 
 def plan_view(device: Device, made: Plan, in_view: int) -> Plan:
-    """Return a plan like `made`, of steps over the chunks in view, with memory for views of up to `in_view` rows.
-    Raises CapacityError."""
+    """Plan steps over the chunks in view again, with memory for views of up to `in_view` rows. Raises CapacityError.
+
+    made: the previous plan of these steps.
+    """
     return plan_by_chunk(replace(made.need, in_view=in_view), made.allowed, device.max_allocation)
 
 

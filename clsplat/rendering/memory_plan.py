@@ -193,12 +193,12 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     by_row = need.row - need.statistics - need.held + need.banded
 
     def without_pairs(slots: int) -> int:
-        """Bytes of a pool of `slots` slots and of the arrays with a row for each Gaussian in view; no pairs yet."""
+        """Bytes of a pool of `slots` slots and of the arrays with a row for each Gaussian in view, without pairs."""
         return slots * by_slot + max(CHUNK_ROWS * listed_chunks(slots), need.in_view) * by_row
 
     def wanted(slots: int) -> int:
-        """Bytes of `without_pairs` and of the pairs: at least one for each row in view, as one tile may list all
-        rows."""
+        """Bytes of `without_pairs` and of arrays of pairs. There is at least one pair for each row in view, as one tile
+        may list all rows."""
         return without_pairs(slots) + max(PAIRS_IN_VIEW * CHUNK_ROWS * slots, need.in_view) * need.pair
 
     most = min(max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1)
@@ -207,7 +207,7 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     most //= CHUNK_ROWS
     slots = bisect_right(range(1, most + 1), room, key=wanted)
     if slots == 0 and most > 0 and without_pairs(1) + PAIRS_IN_VIEW * CHUNK_ROWS * need.pair <= room:
-        slots = 1  # one slot with fewer pairs: few views have a tile that lists all rows
+        slots = 1  # memory for fewer pairs than `wanted` counts: few views have a tile that lists all rows
     if slots == 0:
         raise _too_little(need, budget - room + wanted(1), budget)
     pairs = min((room - without_pairs(slots)) // need.pair, need.most_pairs)

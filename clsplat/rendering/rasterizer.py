@@ -212,7 +212,9 @@ class Rasterizer:
         nearness: bool = False,
         chunks: ChunkList | ChunkNumbers | None = None,
     ) -> ForwardPass:
-        """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
+        """Render a frame: project the Gaussians, list those of each tile by depth, and blend them.
+
+        See Kerbl et al. 2023, algorithm 2.
 
         background: (3,) float32, on the host or the device; or the two arrays that `send` or `keep` returned.
         backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
@@ -246,7 +248,7 @@ class Rasterizer:
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
             listed, one = None, len(bands) == 1
             for band in bands:
-                del listed  # frees memory, which this band may need for larger arrays
+                del listed  # frees the last band's memory, which this band may need
                 listed = self._list(device, projected, band, tiles_of(camera), counted if one else None)
                 blended = blend(device, work, listed.lists, inputs, record=records and one, nearness=nearness)
             assert listed is not None, "an image has at least one tile"
@@ -289,7 +291,7 @@ class Rasterizer:
         return row
 
     def listed(self, frame: ForwardPass, band: Band) -> ListedBand:
-        """The band with its pairs and lists. If a frame has several bands, each reuses the memory of the one before."""
+        """Return a band of the frame with its pairs and lists. Of several bands, each reuses the last one's memory."""
         if len(frame.bands) == 1:
             return frame.listed
         return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))

@@ -47,7 +47,7 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
         if tolerance > 0:
             left_out = left_out + change_bounds(band, degree)
             falls_away = left_out.max(axis=1) <= tolerance
-        else:  # not by `change_bounds`, as squares of coefficients may underflow to zero
+        else:  # without `change_bounds`: a square of a small coefficient may underflow to 0
             falls_away = ~band.any(axis=(1, 2))
         degrees[undecided[~falls_away]] = degree
         undecided, left_out = undecided[falls_away], left_out[falls_away]
@@ -56,7 +56,8 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
     """Return the number of coefficients per channel up to the highest needed degree; and True if each Gaussian should
-    store only its own degree, because this leaves out more than MIN_DROPPED_SH_FRACTION of those above band 0.
+    store only its own degree. This is so if it leaves out more than MIN_DROPPED_SH_FRACTION of the coefficients above
+    band 0.
 
     degrees: (n,), the degree that each Gaussian needs.
     """

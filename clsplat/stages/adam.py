@@ -33,7 +33,7 @@ class AdamStep:
         return self.number % self.config.sh_rest_every == 0
 
     def corrected(self, group: str) -> tuple[float, float]:
-        """Return rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of the group's t-th update."""
+        """Return learning rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), where the step is the group's t-th update."""
         shrunk, root = self.corrections(self.number if group != "sh_rest" else self.number // self.config.sh_rest_every)
         return self.rates[group] / shrunk, root
 

@@ -60,8 +60,8 @@ class GainEntries:
 
     @classmethod
     def of_lens(cls, model: ColourModel) -> GainEntries:
-        """Settings for the update of a lens's entries. Their column sums come after those of the photograph, and their
-        mean over the lenses is not moved to 0."""
+        """Settings for the update of a lens's entries. In the result of `entry_gradient`, these entries come after the
+        photograph's entries. Their mean over the lenses is not subtracted."""
         return cls(first_row=model.entries, centred=False)
 
 
@@ -128,8 +128,8 @@ def develop(
 ) -> None:
     """Remove the colours of a photograph and its lens from `target`, in place.
 
-    colours: (photographs, model.entries).
-    lenses: (number of lenses, model.lens_entries); None if a lens has no entries.
+    colours: colour entries of all photographs, (photographs, model.entries).
+    lenses: colour entries of all lenses, (lenses, model.lens_entries); None if a lens has no entries.
     target: planes (3 or more, rows, stride) of the photograph, the first three of which are colours.
     size: width and height in pixels.
     """
@@ -151,11 +151,12 @@ def entry_gradient(
     size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Return the gradient with respect to colour entries, summed over each pixel column: (model.sums, stride).
+    """Return the loss's gradient with respect to colour entries, summed over each pixel column: (model.sums, stride).
 
-    It is the gradient of the loss if the entries were applied to the render, at entries of 0. Its sum over the columns,
-    times ln 2 for logarithms, is given by equations (184) to (186) of docs/gradients.md.
+    For the gradient, the entries count as 0, and as applied to the render instead of removed from the photograph. The
+    sum over the columns, times ln 2 for logarithms, is given by equations (184) to (186) of docs/gradients.md.
 
+    image, gradient: (3, rows, stride), the render and the gradient with respect to it.
     place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
@@ -184,7 +185,7 @@ def step_gains(
     """Update the colour entries `gains` in place by Adam.
 
     photograph: the photograph or lens of the view, a row of `gains`. All other rows have a gradient of 0.
-    columns: the gradient of this row, summed over each pixel column (`entry_gradient`).
+    columns: the result of `entry_gradient`, which contains the gradient with respect to this row.
     step: the number of this update, from 1.
     readback: counts of the step's pass (`READBACK`). Nothing changes if the pass has stopped (kernels/duplicate.cl).
     """

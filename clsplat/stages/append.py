@@ -55,10 +55,9 @@ def append(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> tuple[Totals, TileLists]:
-    """Make the lists that `duplicate` and `tile_lists` make, for at most `capacity` pairs, without waiting.
+    """Make the same tile lists as `duplicate` and `tile_lists`, but without waiting for the device.
 
-    With more pairs the pass stops (kernels/append.cl).
-
+    capacity: maximum number of pairs. With more pairs the pass stops (kernels/append.cl).
     tiles: numbers of tiles across and down.
     readback: (READBACK_SIZE,) uint32, filled with the counts of the pass. Pass the same array to `project_step`.
     host: host memory, to which `readback` is copied.

@@ -17,7 +17,7 @@ BOUNDS_FLOATS = 7
 
 @stage("bounds")
 def bounds(device: Device, work: Workspace, gaussians: DeviceGaussians, chunks: ChunkList) -> Float32:
-    """Compute the bounds of the chunks in a list, wait for them, and return them: (entries, BOUNDS_FLOATS).
+    """Return the bounds of the chunks in a list, (entries, BOUNDS_FLOATS). Waits for the device.
 
     An entry NO_CHUNK has empty bounds: from infinity to -infinity.
     """

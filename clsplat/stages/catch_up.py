@@ -24,13 +24,14 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
 
 _TABLE_NUMBERS = 2 + len(PARAMETER_GROUPS)
-"""Number of columns of a step table (`step_numbers`): two factors of Adam, then a rate for each parameter group."""
+"""Number of columns of a step table: 1 / sqrt(1 - beta2^t), for all parameter groups but sh_rest and for sh_rest, then
+the learning rate / (1 - beta1^t) of each group (`step_numbers`)."""
 _ABREAST = 4
 """Number of elements that a work-item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
 
 
 def step_table(steps: Iterable[AdamStep]) -> Float32:
-    """Return the table (steps, _TABLE_NUMBERS) for `catch_up`: for each step, the factors of Adam and the rates."""
+    """Return the table (steps, _TABLE_NUMBERS) for `catch_up`, with a row of constants of Adam for each step."""
     return np.array([step_numbers(step, NO_EXPLORATION) for step in steps], np.float32).reshape(-1, _TABLE_NUMBERS)
 
 
@@ -72,7 +73,7 @@ def catch_up(
     last: (k,) uint32, for each of the k entries of `chunks` the last step that updated the chunk with its gradients.
     caught: (chunks of the model,) uint32, the step up to which each chunk has caught up. The call writes `step` for
     the listed chunks, so that a second call for the same step changes nothing.
-    table: must contain all missed steps.
+    table: the numbers of consecutive steps, which must include all missed steps.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the refused updates; an element counts once for each
         step that refuses it.
     """

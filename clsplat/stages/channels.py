@@ -163,9 +163,9 @@ def channels(
     """Blend a row of values of each Gaussian into channels, with the same weights as the image in `blended`.
 
     lists: the tile lists from which the image was blended.
-    wanted: what the rows contain.
+    wanted: the features, or other values, of which a row consists.
     rows: (n, wanted.floats), the values of each Gaussian, such as the result of `features`.
-    held: surfaces of the holdout, if there is one.
+    held: surfaces of the holdout; None without a holdout.
     """
     plane_rows, stride = blended.stops.shape
     means = work.array("channel_means", (wanted.floats + len(DEPTH_PLANES), plane_rows, stride))

@@ -45,8 +45,7 @@ class ChunkList:
 
 
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Pad numbers of chunks with NO_CHUNK. There are only a few padded lengths, so that arrays and command buffers can
-    be reused."""
+    """Pad chunk numbers (k,) with NO_CHUNK to one of a few lengths, so that arrays and command buffers are reused."""
     padded = np.full(listed_chunks(len(numbers)), NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
     return padded

@@ -98,7 +98,7 @@ class ChunkPool:
     def resize(self, rows: int) -> None:
         """Replace the slots by empty slots for `rows` Gaussians, after writing changed chunks back. Raises WriteError.
 
-        If the driver has no memory for them, although the plan has, one slot is allocated.
+        If the driver cannot allocate them, although they are within the memory plan, a single slot is allocated.
         """
         self.release()
         self.free()
@@ -157,7 +157,8 @@ class ChunkPool:
     def place_rows(self, start: int, stop: int) -> None:
         """Copy the rows [start, stop) of the model to the first rows of the pool. They need not be whole chunks.
 
-        So only `keep_rows` can write changes of these rows back. Raises WriteError and ScratchError.
+        So the pool does not know the rows as chunks, and only `keep_rows` can write changes of them back. Raises
+        WriteError and ScratchError.
         """
         self.release()
         for begin, end, slots in self._row_groups(start, stop):
@@ -252,12 +253,12 @@ class ChunkPool:
         return values.view(self.store.record).reshape(-1)
 
     def _groups(self, count: int) -> list[slice]:
-        """Return slices of `count` chunks, which cross the bus one after the other (`residency.CROSSING_SHARE`)."""
+        """Divide `count` chunks into slices that cross the bus one after the other (`residency.CROSSING_SHARE`)."""
         most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
         return [slice(begin, begin + most) for begin in range(0, count, most)]
 
     def _crossing(self, slots: NDArray[np.uint32]) -> tuple[DeviceArray, DeviceArray]:
-        """Upload slots (k,), and return them with device memory for their records."""
+        """Upload the numbers of k slots. Returns the numbers on the device, and device memory for k records."""
         on_device = self._work.array("crossing_slots", slots.shape, np.uint32)
         on_device.set(slots)
         return on_device, self._work.array("crossing", (len(slots), self.store.record.itemsize // 4), np.uint32)
@@ -308,7 +309,7 @@ class StoredArray:
         self.pool.store.set_at(self.field, places, values)
 
     def change(self, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-        """Replace the rows of each chunk by the result of the function `change` for them."""
+        """Replace the rows of each chunk by the array that the function `change` returns for these rows."""
         self.pool.release()
         self.pool.store.change(self.field, change)
 

@@ -14,7 +14,7 @@ from clsplat.stages.deep import DEEP_FLOATS
 
 
 def merge_bytes(pictures: int, bins: int) -> int:
-    """Return the bytes per pixel for a merge of deep pictures: pictures, weights, order of slices, result."""
+    """Return the bytes per pixel of all arrays of `deep_merge`. bins: number of slices of a pixel in each picture."""
     return pictures * (4 + bins * (4 * DEEP_FLOATS + 5)) + 4 * DEEP_FLOATS * bins
 
 

@@ -58,7 +58,7 @@ def statistics_fields(*, contributions: bool) -> dict[str, tuple[int, ...]]:
 
 
 def new_values(*, densified: bool = False) -> NewValues:
-    """Return the values in a store, after density control, that are not copied from old rows.
+    """Return the values that density control gives to rows of a store, where it does not copy them from old rows.
 
     Rows with the bit FRESH get zero moments and infinite statistics.
 
@@ -110,7 +110,7 @@ class DensityStatistics:
         return self.of({name: array.in_pool for name, array in self.named().items()}, of_slots=True)
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
-        """Return the statistics on the device of the Gaussians [start, stop), in a pool from its first slots."""
+        """Return the statistics of the Gaussians [start, stop) on the device. In a pool they are in the first rows."""
         start, stop = (0, stop - start) if self.of_slots else (start, stop)
         if (start, stop) == (0, self.seen.shape[0]):
             return self
@@ -123,7 +123,7 @@ class DensityStatistics:
         return {name: array for name in names if (array := getattr(self, name)) is not None}
 
     def by_field(self) -> dict[str, Any]:
-        """Return the arrays by their names in a checkpoint and in a store of chunks."""
+        """Return the arrays by their names in checkpoints and stores of chunks (such as "statistics/radii")."""
         return {f"{KIND}/{name}": array for name, array in self.named().items()}
 
     def load(self, values: Mapping[str, Float32]) -> None:
@@ -235,8 +235,8 @@ class DeviceRowList:
 class DeviceMarker:
     """Marks which Gaussians of a model are kept, cloned and split, by their statistics.
 
-    The results overwrite the splats of the last frame in `work`. So this frame must not be needed any more, and the
-    results are valid only until the next frame is rendered.
+    The results overwrite the splats of the last frame in the workspace `work`. So this frame must not be needed any
+    more, and the results are valid only until the next frame is rendered.
     """
 
     device: Device
@@ -262,8 +262,8 @@ class DeviceMarker:
     def _pieces(self) -> Iterator[tuple[int, int]]:
         """Yield the ranges [start, stop) of rows that are marked together.
 
-        A streamed model is marked in parts of the rows that are on the device at once. With a pool, a part has half as
-        many rows as the pool, so that marks and statistics fit in the memory of the splats.
+        A streamed model is marked in parts. A part has as many rows as are on the device at once or, with a pool, half
+        as many rows as the pool, so that marks and statistics fit in the memory of the splats.
         """
         model = self.parameters
         rows = model.rows if isinstance(model, HostGaussians) else max(model.count, 1)
@@ -404,7 +404,7 @@ def carried(
 
 
 def _on_device(work: Workspace, rows: DeviceArray | NDArray[np.uint32]) -> Iterator[tuple[int, DeviceArray]]:
-    """Yield parts of a list of rows on the device, each with the index of its first entry."""
+    """Bring a list of rows to the device part by part. Yields the index of a part's first entry, and the part."""
     if isinstance(rows, DeviceArray):
         yield 0, rows
         return

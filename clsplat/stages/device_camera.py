@@ -37,7 +37,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "FY": camera.fy,
         "CX": camera.cx,
         "CY": camera.cy,
-        "NEAR": max(camera.near, 0.0),  # sort keys, the bits of depths, order only positive depths
+        "NEAR": max(camera.near, 0.0),  # depths are sorted by their bits, which orders only positive depths
         "FAR": min(camera.far, FARTHEST_PLANE),
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - window.clamp * half_w,

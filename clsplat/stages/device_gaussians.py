@@ -84,7 +84,7 @@ class HostArray:
         return self.values.shape
 
     def get(self) -> NDArray[Any]:
-        """Return a copy of the array."""
+        """Return a copy of this array."""
         return self.values.copy()
 
     def set(self, values: NDArray[Any]) -> None:
@@ -199,7 +199,7 @@ def parts(
 
 
 def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, stop: int) -> DeviceGaussians:
-    """Upload the rows [start, stop) of a model in main memory, to arrays of the workspace named by `index`."""
+    """Upload the rows [start, stop) of model number `index` from main memory to arrays of the workspace."""
     arrays = {}
     for name, whole in model.arrays.items():
         values = whole.values[start:stop]
@@ -296,7 +296,7 @@ class CopiedRows:
 
 
 def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[np.int64]) -> NDArray[Any]:
-    """Return the records of the chunks `numbers` (k,), from the arrays of `count` Gaussians by name."""
+    """Return the records of the chunks `numbers` (k,). arrays: the fields of all `count` Gaussians, by name."""
     records = np.empty(len(numbers), record_type({name: array.shape[1:] for name, array in arrays.items()}))
     for place, first, length in runs(numbers):
         begin, end = CHUNK_ROWS * first, min(CHUNK_ROWS * (first + length), count)
@@ -360,7 +360,7 @@ def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, value
 
 
 def change_rows(array: AnyArray, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-    """Replace rows of an array by the result of the function `change` for them, all at once or chunk by chunk."""
+    """Replace the rows of an array by the results of `change(rows)`, for all rows at once or chunk by chunk."""
     if isinstance(array, StoredArray):
         array.change(change)
     else:

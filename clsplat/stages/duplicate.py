@@ -26,8 +26,8 @@ slightly past the last pair."""
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
-"""Bytes per Gaussian: its entries of `first_slots`, `gaussian_from_visible` and `depth_keys`, of the sort by depth, and
-of `gaussian_from_rank`, `rank_counts` and `offsets`."""
+"""Bytes per Gaussian: an entry each in `first_slots`, `gaussian_from_visible`, `depth_keys`, `gaussian_from_rank`,
+`rank_counts` and `offsets`, and the Gaussian's share of the sort by depth."""
 BAND_GAUSSIAN_BYTES = 4
 """Additional bytes per Gaussian if there are several bands: the number of the Gaussian's tiles in the band."""
 BAND_TILE_BYTES = 4
@@ -157,8 +157,9 @@ def count_by_capacity(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> Counted:
-    """Count like `count`, but without waiting. With more than `capacity` pairs the pass stops (kernels/duplicate.cl).
+    """Do the work of `count` without waiting for the device.
 
+    capacity: maximum number of pairs. With more pairs the pass stops (kernels/duplicate.cl).
     readback: (READBACK_SIZE,) uint32, filled with the counts. Pass the same array to `project_step`.
     host: host memory, to which `readback` is copied.
 
@@ -212,7 +213,7 @@ def count_band(
     *,
     all_bits: bool = False,
 ) -> Counted:
-    """Count like `count`, for the tiles of a band only. Overwrites the arrays of an earlier count in the workspace."""
+    """Do the work of `count` for the tiles of a band only. Overwrites the workspace's arrays of an earlier count."""
     n = projected.tile_counts.shape[0]
     band_counts = work.array("band_counts", (n,), np.uint32)
     kernel, arrays = device.kernels("duplicate").band_counts, (projected.tile_counts, projected.splats, band_counts)
@@ -224,7 +225,7 @@ def count_band(
 def plan_bands(
     device: Device, work: Workspace, projected: Projected, counted: Counted, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
-    """The fewest bands of at most `capacity` pairs each. Raises CapacityError if a single tile has more pairs."""
+    """Return the fewest bands of at most `capacity` pairs each. Raises CapacityError if a tile has more."""
     if counted.pairs <= capacity:
         return (Band(0, tiles[0] * tiles[1]),)
     n = projected.tile_counts.shape[0]

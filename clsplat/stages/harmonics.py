@@ -107,12 +107,13 @@ def harmonics_grad(
     add_directions: bool = False,
     by_centre: bool = False,
 ) -> DeviceArray | None:
-    """Compute `gradients` from d_colours (n, 3) and the colours of `harmonics`.
+    """Compute the gradients with respect to coefficients and directions from d_colours (n, 3), those of the colours.
 
-    given: the inputs of `harmonics`.
-    add: add the gradients of the coefficients to those that `gradients` has from earlier cameras. False replaces them.
-    add_directions: the same for the gradients of directions or means.
-    by_centre: return the gradient (3,) with respect to the camera's centre.
+    given, colours: the inputs and the result of `harmonics`.
+    gradients: filled with the results.
+    add: True adds the gradients with respect to coefficients to the values that `gradients` has from earlier cameras.
+    add_directions: True does so for the gradients with respect to directions or means.
+    by_centre: True returns the gradient (3,) with respect to the camera's centre.
 
     Equations (38) to (40) and (168).
     """

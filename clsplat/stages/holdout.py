@@ -44,7 +44,7 @@ def held_bytes(surfaces: Surfaces | None) -> int:
 
 
 def upload_held(device: Device, surfaces: Surfaces) -> Held:
-    """Upload the holdout surfaces of an image, at least one."""
+    """Upload the holdout surfaces of an image, which has at least one."""
     height, width = surfaces.counts.shape
     counts = np.zeros(padded_size(width, height), np.int64)
     counts[:height, :width] = surfaces.counts

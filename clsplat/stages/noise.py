@@ -22,14 +22,17 @@ NOISE_OPACITY_RANGE = 0.16
 
 
 def highest_logit(dead: float) -> float:
-    """Return the logit of the opacity above which no noise is added. dead: `Exploration.dead`."""
+    """Return the logit of the opacity above which no noise is added.
+
+    dead: opacity at which half of the noise is added (`Exploration.dead`).
+    """
     highest = dead + NOISE_OPACITY_RANGE
     return log(highest / (1 - highest)) if highest < 1 else inf
 
 
 def noise_numbers(explore: Exploration) -> tuple[float, ...]:
-    """Return the arguments of the kernel add_noise that change from step to step: the words of the random key, and the
-    amount of noise. The tuple is empty without noise."""
+    """Return the arguments of the kernel add_noise that change from step to step: the two words of the random key, and
+    the amount of noise. The result is empty without noise."""
     return () if explore.amount == 0 else (*map(LaunchParameterWord, explore.key), LaunchParameter(explore.amount))
 
 

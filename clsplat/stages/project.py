@@ -254,8 +254,11 @@ def project_grad(
 
 
 def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
-    """Return the numbers that the kernel of `project_step` needs for a step: the penalty weights; 1 / sqrt(1 - beta2^t)
-    for most groups, then for sh_rest; and the learning rate / (1 - beta1^t) of each group."""
+    """Return the numbers of a step for the kernel of `project_step`: the penalty weights; two roots 1 / sqrt(1 -
+    beta2^t), one for sh_rest and before it one for all other groups; for each group the learning rate / (1 - beta1^t).
+
+    t: number of updates of a group, including this step's.
+    """
     rates, number, every = step.rates, step.number, step.config.sh_rest_every
     shrunk, root = of_rest, root_of_rest = step.corrections(number)
     if every > 1:
@@ -280,7 +283,7 @@ def project_step(
     """Do the work of `project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
     model: parameters, first and second moments. If only some chunks were projected, only their Gaussians take the step.
-    The other arguments are those of the two functions.
+    The other arguments are as in `project_grad` and `adam`.
     """
     parameters, config = model[0], step.config
     n = projected.tile_counts.shape[0]
@@ -317,15 +320,18 @@ def project_step(
 
 
 class _Build(NamedTuple):
-    """How project_grad.cl is built: the number of Gaussians per work-item, and the macro LANES if the kernel shape has
-    another number."""
+    """How project_grad.cl is built.
+
+    lanes: number of Gaussians per work-item.
+    defines: the macro LANES, if `lanes` differs from the lanes of the kernel shape.
+    """
 
     lanes: int
     defines: dict[str, object]
 
 
 def _build(device: Device) -> _Build:
-    """Return how project_grad.cl is built. For cameras that evaluate Gaussians along rays, it has one lane."""
+    """Return how project_grad.cl is built: for cameras that evaluate Gaussians along rays, with one lane."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 

@@ -31,7 +31,7 @@ class UploadedCameras:
 
 
 def upload_cameras(device: Device, cameras: Sequence[Camera]) -> list[UploadedCameras]:
-    """Upload the cameras, grouped by model."""
+    """Upload cameras, grouped by camera model."""
     packs: dict[CameraModel, list[NDArray[np.float32]]] = {}
     for camera in cameras:
         packs.setdefault(camera.model, []).append(pack_camera(camera))
@@ -58,7 +58,7 @@ def sampling_limits(
 
 @stage("sampling", limit_scales=1)
 def limit_scales(device: Device, work: Workspace, gaussians: AnyGaussians, least: DeviceArray) -> None:
-    """Raise the log scales of each Gaussian to its number in `least` (n,), where they are lower."""
+    """Replace each log scale of Gaussian i that is less than least[i] by least[i]. least: (n,)."""
     kernel = device.kernels("sampling", {"LANES": 1}).limit_scales
     for start, stop, (part,) in parts(work, gaussians, keep=True):
         launch_items(device, kernel, part.count, part.count, least.rows(start, stop), part["log_scales"])

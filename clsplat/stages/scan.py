@@ -42,7 +42,7 @@ class Elements:
 
     @property
     def defines(self) -> dict[str, object]:
-        """Macros for the build of a kernel that takes `arguments`."""
+        """Macros for the build of a kernel that gets its number of elements by `arguments`."""
         return {} if self.counts is None else {"BY_CAPACITY": True}
 
 

@@ -18,8 +18,9 @@ def padded(count: int) -> int:
 
 @stage("sums")
 def row_sums(device: Device, work: Workspace, name: str, parts: DeviceArray) -> DeviceArray:
-    """Sums (rows,) of the rows of `parts` (rows, columns), float32, in workspace arrays under `name`.
+    """Return the sum of each row of `parts` (rows, columns), float32: an array (rows,) of the workspace.
 
+    name: first part of the names of the workspace arrays for the sums.
     The number of columns must be a result of `padded`; without columns the sums are 0.
     """
     rows, columns = parts.shape

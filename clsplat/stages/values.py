@@ -24,7 +24,8 @@ _MAX_LOCAL_SUMS = 2048
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
-    """Yield the first value and the number of values of each pass over the values [first, depth).
+    """Divide the values with indices [first, depth) into passes. Yields the first index of a pass, and its number of
+    values.
 
     most: maximum number of values per pass.
     """
@@ -89,7 +90,7 @@ def values_grad(
 ) -> None:
     """Fill every row of `gradients` from the gradients with respect to blended values and alpha.
 
-    of: the blended values, and the image whose weights they have.
+    of: the arguments of `values`: the values, and the image by whose weights they are blended.
     first_slots: (n,), the first slot of each Gaussian.
     d_pixels: (height, width, depth), the gradient with respect to the blended values.
     d_alpha: (height, width), the gradient with respect to alpha; None means zero.

@@ -2,8 +2,8 @@
 // equation (48) in docs/gradients.md. A group of several items keeps D . B of equation (22), which takes fewer
 // instructions and is more precise.
 
-// BEHIND: the light behind all pairs of a pixel, the background. t: the final transmittance; at_end: the gradient with
-// respect to t.
+// BEHIND: the light behind all pairs of a pixel, which is the background's. t: the final transmittance; at_end: the
+// loss's gradient with respect to t.
 #if ITEMS == 1
 #define BEHIND(t, at_end) ((t) * (at_end))
 #else

@@ -186,16 +186,16 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
 }
 
 // An entry of a list: the pair's number in its batch, with the bit DENSE if the pair reaches more than half of the
-// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE minus the number
-// of reached blocks, negative for DENSE.
+// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE, the largest
+// number of reached blocks without DENSE, minus the number of reached blocks.
 #define DENSE 0x80000000u
 #define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))
 #define SPARSE(own) (ALL_REACHED ? (own) : (own) / 2)
 #define IS_DENSE(entry, own) (SPARSE(own) == 0 || (SPARSE(own) < (own) && ((entry) & DENSE)))
 
-// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, a bit for each pair. The top byte of each product has the
-// marks of four pairs.
+// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, a bit for each pair. A multiplication collects the marks
+// of four pairs in the top byte of the product.
 static inline uint marked_from(__local const uint *marks, int begin) {
   uint marked = 0;
   _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
@@ -213,7 +213,8 @@ static inline uint marked_from(__local const uint *marks, int begin) {
     count += popcount(marked);                                                                                         \
   }
 
-// Defines the same variables for a splat `s` in local memory (Staged) as SPLAT_HERE for a splat in global memory.
+// Defines position, whitening, opacity and colour of a splat as variables, from the splat `s` in local memory (Staged).
+// SPLAT_HERE defines all but the colour, from a splat in global memory.
 #define SPLAT_STAGED(s)                                                                                                \
   __global const float *splat = splats + (size_t)SPLAT_SIZE * s.kept;                                                  \
   const float mx = s.mx, my = s.my, l11 = s.l11, l12 = s.l12, l22 = s.l22, log2o = s.log2o;                            \

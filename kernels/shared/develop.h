@@ -24,8 +24,8 @@ static inline floatL spread(const int x, const int y, const float across, const 
   return fmaL(from_x, from_x, (floatL)(from_y * from_y)) * scale;
 }
 
-// Removes a photograph's own colours: gains, logs, lenses, target -> target, in place. The render is compared with the
-// result.
+// Removes a photograph's own colours from `target`, in place; the render is compared with the result. logs: the entries
+// of all photographs; gains: 2^logs; lenses: the entries of all lenses.
 __kernel void develop(const int photograph, const int lens, const int stride, const int plane, const float across,
                       const float down, const float scale, __global const float *gains, __global const float *logs,
                       __global const float *lenses, __global float *target) {
@@ -37,8 +37,8 @@ __kernel void develop(const int photograph, const int lens, const int stride, co
   STOREL(colour[0], target + at), STOREL(colour[1], target + next), STOREL(colour[2], target + last);
 }
 
-// Sums the gradients with respect to the entries over the rows of a tile: image, gradient with respect to image ->
-// partials.
+// Sums the gradients with respect to the entries over the rows of a tile. image: the render; gradient: the loss's
+// gradient with respect to the render -> partials.
 __kernel void entry_sums(const int height, const int stride, const int plane, const int tiles_y, const float across,
                          const float down, const float scale, __global const float *image,
                          __global const float *gradient, __global float *partials) {

@@ -7,7 +7,7 @@
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// Least determinant of the covariance without the low-pass for which the compensation has a gradient.
+// The compensation has no gradient if the determinant of the covariance without the low-pass is this or less.
 #define LEAST_DETERMINANT 1e-30f
 
 typedef struct {
@@ -89,8 +89,10 @@ static inline floatL atan_of_ratio(floatL x) {
   return fmaL(t * p, x, x);
 }
 
-// Computes `away`, `bend`, `bend2` and `inverse` of a fisheye's projection, equations (157) and (158) of
-// docs/gradients.md. Near the axis series are used, because terms of the closed forms nearly cancel there.
+// Computes four fields of a fisheye's projection, equations (157) and (158) of docs/gradients.md: away = theta / r,
+// bend = (d away / dr) / r, bend2 = (d bend / dr) / r, and inverse, 1 / the squared length of (x, y, z). r is the
+// distance from the axis and theta the angle from it. Near the axis series are used, because terms of the closed forms
+// nearly cancel there.
 static inline void fisheye_of(Ellipse2 *p) {
   const floatL q = fmaL(p->x, p->x, p->y * p->y), d = fmaL(p->z, p->z, q);
   const floatL up = 1.0f / p->z, up2 = up * up, t = q * up2;

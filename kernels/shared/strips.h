@@ -36,7 +36,7 @@
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
 // Rows of a pair in local memory: one for each field of its slot. If several warps share the strip, the same memory
-// first holds LEFT rows for each block: the values that leave_pixel stores.
+// first holds LEFT rows for each block: the values of the block's pixels, which are not added up yet.
 #ifdef RAYS
 #define LEFT 4 // g, weight, u and v
 #else
@@ -80,7 +80,7 @@ static inline void finish_row(float v, float *sums) {
   }
 
 #if TEAM_WARPS > 1
-// Stores a pixel's values in local memory, for the lane that adds them up in join_blocks.
+// Stores a pixel's g, weight and whitened coordinates in local memory, from which a lane adds up several pixels.
 #define LEAVE_PIXEL(cell, block_rows)                                                                                  \
   {                                                                                                                    \
     ALPHA_IN(cell)                                                                                                     \
@@ -97,8 +97,9 @@ static inline void leave_pixel(Share share, float u, float v, __local float *blo
 #endif
 }
 
-// Adds up what leave_pixel has stored for a pair that reaches the blocks in the set `blocks`, and stores the sums in
-// the pair's first rows. strip: the image's gradient in the lane's pixel of each block.
+// Adds up a pair's gradients in the lane's pixel of each block, from the values that LEAVE_PIXEL has stored, and stores
+// the sums in the pair's first rows. blocks: the set of blocks that the pair reaches; strip: the image's gradient in
+// the lane's pixel of each block.
 static inline void join_blocks(uint blocks, const Pixels *strip, float v, float l11, float l12, float l22,
                                __local float *pair_rows) {
   float sums[SLOT_STRIDE];
@@ -131,8 +132,8 @@ static inline void load_strip(__global const float *image_gradient, __global con
 }
 #endif
 
-// Loads the indices of the Gaussian and the slot for the fetch of an item with the number `fetch`. The pairs of a batch
-// run backwards from index `batch` - 1.
+// Loads the Gaussian's index and the slot of a pair of a batch. Each item fetches several pairs; `fetch` counts them.
+// The pairs of a batch run backwards from index `batch` - 1.
 #define FETCH_INDICES(fetch, batch)                                                                                    \
   {                                                                                                                    \
     const int from = max((batch) - 1 - ITEM - fetch * ITEMS, begin);                                                   \

@@ -50,9 +50,9 @@ def _path(device: cl.Device, digest: str) -> Path:
 
 
 def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[str]) -> cl.Program | None:
-    """Return the cached program of a variant, given its digest and build options.
+    """Return the program of a variant from the cache; None if no intact file is found, or the driver refuses the file.
 
-    Returns None if the cache has no intact file of it, or the driver refuses the file.
+    digest, options: digest and build options of the variant.
     """
     if not wants_cache(device):
         return None

@@ -97,7 +97,7 @@ def _driver(path: Path) -> Diagnostic:
 
 
 def listed_devices() -> tuple[list[dict[str, Any]], str]:
-    """Run `clsplat devices --json`. Return the devices that it lists, and the reason if it fails, or ""."""
+    """Return the devices that `clsplat devices --json` lists, and why the command failed; "" if it has not failed."""
     result = _outcome(*python_module("clsplat", "devices", "--json"))
     if result is None:
         return [], f"a driver does not answer within {driver_timeout():g} s"

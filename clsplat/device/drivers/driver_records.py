@@ -166,9 +166,9 @@ def remember(
 
 
 def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
-    """Write a JSON file, under a lock against other processes and threads. `changed` is called for its new content.
+    """Write a JSON file, under a lock against other processes and threads. Raises OSError.
 
-    Raises OSError.
+    changed: function that returns the new content of the file. It is called while the lock is held.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with briefly_locked(path):

@@ -233,7 +233,7 @@ def python_module(module: str, *words: str) -> list[str]:
     Unlike `python -m`, the command imports nothing from the current folder. Raises DriverError if Python does not know
     the path of its executable.
     """
-    if not sys.executable:  # so in a program that embeds Python
+    if not sys.executable:  # it is empty in a program that embeds Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
     root = str(Path(__file__).resolve().parents[3])
     code = (

@@ -13,7 +13,8 @@ static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z
   return (floatL)(0.0f);
 }
 
-// The Jacobian's row for x or y, equation (16) of docs/cameras.md. The arguments are those of perspective.h.
+// Computes rx and jx of the Jacobian's row for x, equation (16) of docs/cameras.md; for y the same function gives ry
+// and jy. The arguments are explained at jacobian_row in perspective.h.
 static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
   *rx = (floatL)(0.0f);
   *jx = (floatL)(focal);
@@ -21,8 +22,8 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #endif
 
 #ifdef NEEDS_GRADIENT
-// The gradient with respect to the mean in the camera's axes, equation (20) of docs/cameras.md. The arguments are those
-// of perspective.h.
+// The gradient d (3) with respect to the mean in the camera's axes, equation (20) of docs/cameras.md. The arguments are
+// explained at mean_gradient in perspective.h.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   d[0] = jx * d_mx;
