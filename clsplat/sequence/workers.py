@@ -42,7 +42,8 @@ from clsplat.sequence.task import (
 Result = tuple[Record, VideoPlanes | None]
 """Record of a frame, and the planes to encode if the frame belongs to a video."""
 WRITE_QUEUE_BYTES = 1 << 30
-"""Main memory in bytes that frames in progress may take. Two frames more than devices are always allowed."""
+"""Main memory in bytes that frames in flight (rendered but not yet written) may take. Two frames more than devices are
+always allowed."""
 ENCODING_COPIES = 3
 """Number of copies of a frame in memory while it is encoded: the rendered, the assembled and the converted frame."""
 

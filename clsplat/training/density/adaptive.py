@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Policy only: no device."""
+"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Policy only: no device.
+
+Steps and thresholds are settings: `DensityConfig` in `config/training.py`.
+"""
 
 from __future__ import annotations
 

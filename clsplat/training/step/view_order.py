@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the views in an epoch, a pass through the training photographs (--view-order). Policy only: no device.
 
-A pass shows each view once. Its order is random, or alternates between four clusters of views that look at near points.
+A pass shows each view once. Its order is random (a shuffle), or alternates between four clusters of views that look at
+near points.
 """
 
 from __future__ import annotations
