@@ -329,7 +329,7 @@ class Encoding:
     depth: type of colour, alpha and normals in EXR files: "half" or "float".
     parts: "one" part for all channels of an EXR file, or "several".
     compression: compression of EXR files.
-    bits: bits per channel, 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
+    bits: bits per channel (bit depth), 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
     quality: quality of JPEG files, 1 to 100.
     prores: ProRes profile of MOV files.
     """

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
 from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
 
-TILE = 16
+TILE = 16  # tile_size in gsplat
 """Tile size: side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
 LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
