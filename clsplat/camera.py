@@ -73,7 +73,7 @@ PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAME
 """The model of each projection without options (`radial`, `by_rays`). Messages and the self-test use this order."""
 
 JACOBIAN_CLAMP_HALF_FRAMES = 0.3
-"""Default of `Window.clamp`, in halves of the frame's size."""
+"""Default of `Window.clamp`, in halves of the frame's size: the Jacobian is clamped at 1.3 tan(fov / 2)."""
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that end a process (Ctrl-C, SIGTERM, SIGHUP), child processes, and standard streams that are closed."""
+"""Signals that end a process (Ctrl-C, SIGTERM, SIGHUP), child processes, and standard streams that are closed.
+
+Worker processes of drivers, and their time limits: `device/drivers/worker_process.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations as matrices and as quaternions."""
+"""Rotations as matrices and as quaternions in the order w x y z (wxyz)."""
 
 from __future__ import annotations
 

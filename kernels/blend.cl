@@ -1,5 +1,5 @@
 // Front-to-back alpha blending of each tile's list of Gaussians into an image, until a pixel's transmittance is used
-// up.
+// up (TRANSMITTANCE_MIN in shared/math.h).
 //
 // Owner: A group owns a tile. On a CPU (ITEMS == 1) a work-item loops over the tile's Gaussians; for each it loops over
 //   the cells of open pixels that the ellipse reaches. On a GPU (LANES == 1) each work-item owns pixels. The group

@@ -15,7 +15,7 @@
 #include "shared/rays.h"
 #endif
 
-// Norm of the i-th row of `screen` (n, 2), converted from per pixel to per unit of NDC: equation (43) of
+// Norm (grad2d) of the i-th row of `screen` (n, 2), converted from per pixel to per unit of NDC: equation (43) of
 // docs/gradients.md.
 static inline float ndc_norm(__global const float *screen, const size_t i, const float x_scale, const float y_scale) {
   const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];

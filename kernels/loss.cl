@@ -1,5 +1,5 @@
 // The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient. SSIM has the usual 11 x 11 Gaussian window, sigma 1.5,
-// with zeros outside the image. The window is separable: it is applied vertically, into local memory, then
+// with zero padding outside the image. The window is separable: it is applied vertically, into local memory, then
 // horizontally. A second pair of passes, the adjoint of the first pair, convolves SSIM's three partial derivatives.
 //
 // Owner: A group owns blocks of one channel. With ITEMS == 1 a group processes a block from the top, ROWS rows at a

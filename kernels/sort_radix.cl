@@ -1,6 +1,6 @@
 // One pass of a stable least-significant-digit radix sort in three launches: the histogram of each chunk, the scan of
 // each digit's counts over the chunks, and the scatter. No group waits for another group. If a single work-item sorts
-// all keys, one launch (radix_sort) does all passes.
+// all keys, one launch (radix_sort) does all passes. Sort keys and their bits: clsplat/stages/duplicate.py.
 //
 // Owner: A group owns a chunk, and in radix_offsets `rows` digits. In the scatter, a group of one item moves its keys
 //   one by one. A larger group loads TILE keys at a time, sorts them by digit in local memory, and writes the keys of a

@@ -2,6 +2,8 @@
 """The equirectangular camera: a panorama in longitude and latitude.
 
 Equation numbers refer to docs/cameras.md.
+
+Gaussians at the poles and the seam: `kernels/project_rays.cl`, `kernels/shared/tile.h`.
 """
 
 from __future__ import annotations

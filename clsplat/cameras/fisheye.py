@@ -2,6 +2,8 @@
 """Fisheye cameras: equidistant, and with distortion coefficients.
 
 Equation numbers refer to docs/cameras.md.
+
+The inverse of the distortion in kernels: `kernels/shared/camera/bent_fisheye.h`.
 """
 
 from __future__ import annotations

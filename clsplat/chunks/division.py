@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Division of a streamed model's rows into chunks, and new chunks where density control has changed rows."""
+"""Division of a streamed model's rows into chunks, and new chunks where density control has changed rows.
+
+The size of a chunk: CHUNK_ROWS in `layouts/columns.py`.
+"""
 
 from __future__ import annotations
 

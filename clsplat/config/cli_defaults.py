@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-TEST_EVERY = 8
+TEST_EVERY = 8  # llffhold in the 3DGS authors' code
 """Default of --test-every: every eighth view in the order of names is held out, starting with the first."""
 TEST_MOST = 200
 """Default of --test-most: the maximum number of held-out views."""

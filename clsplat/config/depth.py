@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of depth supervision: known depths that training compares with the render."""
+"""Settings of depth supervision: known depths that training compares with the render.
+
+Depth channels of frames, expected, median or first: `config/channels.py`, `kernels/channels.cl`.
+"""
 
 from __future__ import annotations
 

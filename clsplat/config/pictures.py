@@ -131,7 +131,7 @@ class WarpConfig:
 class SamplingConfig:
     """Shutter and lens, for motion blur and depth of field."""
 
-    samples: int = 16
+    samples: int = 16  # shutter samples, lens samples
     """Pictures that are rendered and averaged for each frame with motion blur or depth of field. More are smoother, and
     take proportionally longer."""
     shutter_angle: float | None = None
@@ -289,7 +289,7 @@ class DeepConfig:
 
 ProRes = Literal["422", "hq", "4444"]
 DEFAULT_VIDEO_FPS = 24.0
-"""Frames per second of a video if neither a flag nor the cameras' file gives a rate."""
+"""Frame rate, in frames per second, of a video if neither a flag nor the cameras' file gives a rate."""
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,7 @@ class Encoding:
     depth: type of colour, alpha and normals in EXR files: "half" or "float".
     parts: "one" part for all channels of an EXR file, or "several".
     compression: compression of EXR files.
-    bits: bits per channel, 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
+    bits: bits per channel (bit depth), 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
     quality: quality of JPEG files, 1 to 100.
     prores: ProRes profile of MOV files.
     """

@@ -19,7 +19,7 @@ STEREO_STAGE_WORD = "stage"
 class StereoConfig:
     """Pairs of pictures, for the left and the right eye."""
 
-    stereo: str = ""
+    stereo: str = ""  # interaxial distance
     """Distance of the eyes in the scene's units, to render a frame for each eye; or stage, for the two cameras of a USD
     stage with stereoRole left and right. Writes two files if -o has {eye}, %V (left, right) or %v (l, r), else one EXR
     file with a part for each eye. '' renders no pairs."""

@@ -2,7 +2,7 @@
 """Settings of training: learning rates and Adam, density control, loss, photographs, points and refinement.
 
 Flags, help and `config.toml` come from these dataclasses. The defaults follow the 3DGS authors' code of 2024, with the
-paper's resolution warm-up.
+paper's resolution warm-up. A comment beside a setting has its names in that code and in gsplat.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ step first needs it, and --photos auto stores photographs with 8 bits per channe
 class OptimiserConfig:
     """Learning rates and Adam's constants, with a rate per parameter group."""
 
-    means_rate: float = 1.6e-4
+    means_rate: float = 1.6e-4  # position_lr_init, means_lr
     """Learning rate of the Gaussians' centres (means) at the first step, relative to the scene's length unit."""
-    means_rate_end: float = 1.6e-6
+    means_rate_end: float = 1.6e-6  # position_lr_final
     """Learning rate of the means after means-rate-steps, relative to the length unit. Until then the rate falls
     exponentially."""
-    means_rate_steps: int = 30_000
+    means_rate_steps: int = 30_000  # position_lr_max_steps
     """Steps over which the learning rate of the means falls."""
-    sh_dc_rate: float = 2.5e-3
+    sh_dc_rate: float = 2.5e-3  # feature_lr, sh0_lr
     """Learning rate of the colours: the constant band of the spherical harmonics."""
-    sh_rest_rate: float = 2.5e-3 / 20
+    sh_rest_rate: float = 2.5e-3 / 20  # feature_lr / 20, shN_lr
     """Learning rate of the colours' dependence on direction: the higher bands of the spherical harmonics."""
-    opacities_rate: float = 0.025
+    opacities_rate: float = 0.025  # opacity_lr, opacities_lr
     """Learning rate of the opacities, as logits."""
-    scales_rate: float = 5e-3
+    scales_rate: float = 5e-3  # scaling_lr, scales_lr
     """Learning rate of the scales, as logarithms."""
-    quaternions_rate: float = 1e-3
+    quaternions_rate: float = 1e-3  # rotation_lr, quats_lr
     """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
     """Do not update parameters whose gradient is zero, nor their Adam moments (approximate). The gradient is zero for
@@ -102,35 +102,35 @@ class OptimiserConfig:
 class DensityConfig:
     """Adaptive density control: when Gaussians are added and removed (Kerbl et al. 2023, section 5)."""
 
-    every: int = 100
+    every: int = 100  # densification_interval, refine_every
     """Steps between densifications, which clone, split and prune Gaussians; 0 turns density control off."""
-    start: int = 500
+    start: int = 500  # densify_from_iter, refine_start_iter
     """Last step without densification: Gaussians are cloned, split and pruned only after later steps."""
-    stop: int = 15_000
+    stop: int = 15_000  # densify_until_iter, refine_stop_iter
     """First step without further density control: Gaussians are no longer cloned, split and pruned, nor opacities
     reset."""
-    gradient_threshold: float = 2e-4
+    gradient_threshold: float = 2e-4  # densify_grad_threshold, grow_grad2d
     """Mean screen-space gradient from which a Gaussian is densified (cloned or split), in units of half the image.
     Lower values make more Gaussians."""
-    absolute_gradients: bool = False
+    absolute_gradients: bool = False  # absgrad
     """Compare gradient-threshold with sums of absolute per-pixel gradients (AbsGS). gradient-threshold should then be
     about 8e-4."""
-    dense_fraction: float = 0.01
+    dense_fraction: float = 0.01  # percent_dense, grow_scale3d
     """Largest scale of a Gaussian that is cloned, relative to the scene's length unit; larger ones are split."""
     split_factor: float = 1.6
     """Factor by which each half of a split Gaussian is smaller than the original."""
-    min_opacity: float = 0.005
+    min_opacity: float = 0.005  # prune_opa
     """Prune Gaussians whose opacity is less than this, 0 to 1."""
-    max_world_fraction: float = 0.1
+    max_world_fraction: float = 0.1  # prune_scale3d
     """Prune Gaussians larger than this fraction of the scene's length unit, after the first opacity reset."""
-    max_screen_radius: float = 0.0
+    max_screen_radius: float = 0.0  # max_screen_size, prune_scale2d
     """Prune Gaussians that covered a larger radius than this on the screen, in pixels, after the first opacity reset; 0
     prunes none."""
-    opacity_reset_every: int = 3000
+    opacity_reset_every: int = 3000  # opacity_reset_interval, reset_every
     """Steps between opacity resets; 0 for none. A white background adds a reset at density.start."""
     opacity_reset_to: float = 0.01
     """Maximum opacity after a reset."""
-    max_gaussians: int = 10_000_000
+    max_gaussians: int = 10_000_000  # cap_max
     """Maximum number of Gaussians, at which cloning and splitting stop. Near the limit, Gaussians with the largest
     gradients are cloned and split first."""
     growth: Growth = "paper"
@@ -146,13 +146,13 @@ class DensityConfig:
     spread: float = 1.0
     """With growth mcmc: random distance of a moved Gaussian from its target's mean, in standard deviations. 0 puts it
     at the mean, as published. Applies only if there are more Gaussians to move than Gaussians with a gradient."""
-    noise_rate: float = 5e5
+    noise_rate: float = 5e5  # noise_lr
     """With growth mcmc: noise added to the means in each step, in multiples of the means' learning rate. The value is
     for Gaussians of scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
-    opacity_weight: float = 0.01
+    opacity_weight: float = 0.01  # opacity_reg
     """With growth mcmc: weight of the opacities in the loss. They are summed over the Gaussians in the step's view, and
     divided by the number of all Gaussians."""
-    scale_weight: float = 0.01
+    scale_weight: float = 0.01  # scale_reg
     """With growth mcmc: like opacity-weight, but for scales relative to the scene's length unit."""
     min_contribution: float = 0.0
     """Prune Gaussians whose contribution to each training view in an epoch (a pass through all) is less than this. A
@@ -206,10 +206,10 @@ class DensityConfig:
 class TrainConfig:
     """Settings of a training."""
 
-    iterations: int = 30_000
+    iterations: int = 30_000  # max_steps
     """Number of training steps, each of one view. Learning rates and density control do not depend on it, except for
     --optimiser.cooldown, --schedule short and high-rates, and --preset fast."""
-    batch: int = 1
+    batch: int = 1  # batch_size
     """Views whose gradients are summed before the model changes. Each view still counts as a step. Learning rates and
     Adam's constants are scaled for the batch (Zhao et al. 2024). If not given: one view for each device."""
     seed: int = 0
@@ -217,11 +217,11 @@ class TrainConfig:
     sh_degree: int = 3
     """Highest degree of the spherical harmonics (SH): how finely colours depend on the viewing direction, 0 (not at
     all) to 3."""
-    sh_degree_every: int = 1000
+    sh_degree_every: int = 1000  # sh_degree_interval
     """Steps after which the SH degree in use rises by one, from 0 to sh-degree."""
-    dssim_weight: float = 0.2
+    dssim_weight: float = 0.2  # lambda_dssim, ssim_lambda
     """Weight w of D-SSIM (structural dissimilarity) in the loss, 0 to 1. L1 (mean absolute difference) has 1 - w."""
-    background: Background = "black"
+    background: Background = "black"  # white_background, random_background, random_bkgd
     """Background behind the Gaussians and behind images with alpha. random: a new colour each step, and black in
     evaluations."""
     thinning: float = 0.0
@@ -278,7 +278,7 @@ class TrainConfig:
     """Handling of fisheye photographs. undistort: convert to the pinhole pictures that they contain. native: train with
     the fisheye lens, which shows the whole photograph, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) are always
     trained natively."""
-    random_points: int = 100_000
+    random_points: int = 100_000  # init_num_pts
     """Number of Gaussians to start from, at random places, if a scene has no points."""
     points: str = ""
     """File of points to start from, in the scene's frame: PLY (also COLMAP's fused.ply), or LAS and LAZ with the extra
@@ -296,7 +296,7 @@ class TrainConfig:
     depth: DepthSource = "none"
     """Known depths to compare with the render. points: the points of a COLMAP model, in the photographs that show them.
     maps: depth maps in depths/ next to images/, or depth_file_path of transforms.json. none: no depths."""
-    depth_weight: float = 0.01
+    depth_weight: float = 0.01  # depth_lambda
     """Weight of the depth loss at the first step. The loss is the mean difference of inverse depths, in units of one
     over the scene's length unit. The weight falls to a hundredth at the last step."""
     depth_maps: MapKind = "metric"
@@ -322,10 +322,10 @@ class TrainConfig:
     appearance_rate: float = 2e-3
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
     the root of the number of photographs and, for gains in a training of fewer than 10,000 steps, by 10,000 / steps."""
-    refine_poses: bool = False
+    refine_poses: bool = False  # pose_opt
     """Refine the poses of all training views but two while the model is trained. refined/ in the run has the cameras as
     a COLMAP model. eval.json has the PSNR of held-out views after aligning them with the model. Not with batches."""
-    pose_reach: float = 5.0
+    pose_reach: float = 5.0  # in place of a learning rate such as pose_opt_lr
     """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is this
     angle in radians, times the scene's length unit."""
     refine_lenses: bool = False

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: make photos of a synthetic scene, recover their poses, train, evaluate and render a turntable."""
+"""The demo: make photos of a synthetic scene, recover their poses, train, evaluate and render a turntable.
+
+Number of steps: DEMO_ITERATIONS in `config/cli_defaults.py`.
+"""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class Device:
         self.calls = Calls()
         self.command_buffers: list[CommandBuffer] = []
         self.under_way: list[object] = []
-        self._options = "-cl-std=CL1.2"
+        self._options = "-cl-std=CL1.2"  # no fast-math, so that all drivers compute the same bits
         if capabilities.exact_division:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...], int], Kernels] = {}

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Main module of the sandbox process, which builds and launches kernels for trial. A crash of the driver ends this
-process, and not the process that wants the kernels."""
+process, and not the process that wants the kernels.
+
+Limits of a trial's memory and items: `device/sandbox.py`.
+"""
 
 from __future__ import annotations
 

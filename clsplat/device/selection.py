@@ -73,8 +73,8 @@ def limits(device: cl.Device) -> dict[str, object]:
 def select(selector: str | None) -> cl.Device:
     """Return the first device that `selector` names: an index, `cpu`, `gpu`, or part of a name, platform or version.
 
-    With None, CLSPLAT_DEVICE is the selector. If it is not set either, the result is the first GPU, or without a GPU
-    the first device. Raises DeviceError.
+    With None, CLSPLAT_DEVICE is the selector. If it is not set either, a GPU is preferred: the result is the
+    first GPU, or without a GPU the first device. Raises DeviceError.
     """
     driver_timeout()  # raises InputError if CLSPLAT_DRIVER_TIMEOUT is invalid, before the first kernel does
     devices = list(zip(all_devices(), list_devices(), strict=True))

@@ -54,8 +54,8 @@ def claim(target: Path) -> Path | None:
     """Claim the file `target`, which this process is going to write.
 
     Returns the marker file, which `give_back` removes; None if another process has the claim. The caller updates the
-    marker's modification time regularly. Other processes take over a claim that is ABANDONED_FILE_SECONDS old, or whose
-    process has ended. Raises OSError if the folder cannot be written.
+    marker's modification time regularly. Other processes take over a stale claim, one that is ABANDONED_FILE_SECONDS
+    old, or whose process has ended. Raises OSError if the folder cannot be written.
     """
     path = _claim_of(target)
     for _ in range(2):

@@ -2,7 +2,8 @@
 """Lens distortion of rendered frames: where a distorted picture's pixels lie in an undistorted picture, by an STMap or
 a photograph's lens.
 
-The undistorted picture is rendered as far as these positions reach, also beyond the frame. Module `warp` samples it.
+The undistorted picture is rendered as far as these positions reach, also beyond the frame (overscan). Module `warp`
+samples it.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 
 The positions of samples are fixed, and samples of shutter and lens have equal weights. So a frame has the same bits
 each time it is rendered. Only linear light is averaged. Channels that cannot be averaged come from a single sample.
+
+Number and times of a frame's samples: `SamplingConfig` in `config/pictures.py`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 
 Gaussians are blended in the colour space of their training photographs. Operations that add light (filters, shutter,
 lens) work on linear values. OpenColorIO converts the output, by default with the configuration built into OpenImageIO.
-This module computes the sRGB curve itself, because OpenColorIO's fast approximation is off by up to 3e-4.
+This module computes the sRGB curve (gamma) itself, because OpenColorIO's fast approximation is off by up to 3e-4.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def srgb_to_linear(values: Float32) -> Float32:
 
 
 def linear_to_srgb(values: Float32) -> Float32:
-    """Encode linear values by the sRGB curve, the inverse of `srgb_to_linear`."""
+    """Encode linear values by the sRGB curve (gamma), the inverse of `srgb_to_linear`."""
     edge = np.float32(0.04045 / 12.92)
     curve = np.float32(1.055) * np.maximum(values, edge) ** np.float32(1 / 2.4) - np.float32(0.055)
     return np.where(values > edge, curve, values * np.float32(12.92)).astype(np.float32, copy=False)

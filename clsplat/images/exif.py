@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure of a photograph (exposure time, ISO speed, f-number) from its EXIF data."""
+"""Exposure of a photograph (exposure time, ISO speed, f-number) from its EXIF data.
+
+Orientation: `images/reading.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing of image files (PNG, EXR and others) with OpenImageIO, atomically: a failure leaves the earlier file."""
+"""Writing of image files (PNG, EXR and others) with OpenImageIO, atomically: a failure leaves the earlier file.
+
+Depth, compression and quality of files: `Encoding` in `config/pictures.py`.
+"""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
 from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
 
-TILE = 16
-"""Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
+TILE = 16  # tile_size in gsplat
+"""Tile size: side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
 LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
 """Sizes of the blocks of pixels that work-groups of the loss kernel process (`kernels/loss.cl`).
@@ -39,7 +39,7 @@ It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 r
 """
 
 CHUNK_ROWS = 1024
-"""Number of consecutive rows of a model in a chunk; the last chunk may have fewer."""
+"""Chunk size: number of consecutive rows of a model in a chunk; the last chunk may have fewer."""
 
 POSE_ROWS = 64
 """Number of Gaussians whose terms of a pose gradient one work-item adds in sequence, to a partial sum."""
@@ -126,7 +126,7 @@ COLUMNS, ROWS: the bounding box in tiles: 16 bits for the first tile, 16 for the
 """
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
-"""Partial gradients of a (tile, Gaussian) pair. ABSX and ABSY exist only if absolute gradients are computed.
+"""Partial gradients of a (tile, Gaussian) pair. ABSX and ABSY exist only if absolute gradients (absgrad) are computed.
 
 If contributions are computed, the sum of blending weights follows. If the loss compares depths, the gradient with
 respect to nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).

@@ -227,7 +227,10 @@ def _rotated(quaternions: Float32, rotation: Float64) -> Float32:
 
 
 def rotate_sh(sh: Float32, turn: Float64) -> Float32:
-    """Rotate SH coefficients (n, K, 3) by the matrix Q = `turn` (3, 3): a rotation, possibly with a reflection."""
+    """Rotate SH coefficients (n, K, 3) by the matrix Q = `turn` (3, 3): a rotation, possibly with a reflection.
+
+    `sh_rotations` has the matrices of the bands, Wigner's D-matrices in the real basis.
+    """
     degree = round(sh.shape[1] ** 0.5) - 1
     turned = sh.copy()
     for band, matrix in enumerate(sh_rotations(turn, degree)[1:], start=1):

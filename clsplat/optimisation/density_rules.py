@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 for comparisons on the device."""
+"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 for comparisons on the device.
+
+Their values are settings: `DensityConfig` in `config/training.py`. Steps and opacity resets:
+`training/density/adaptive.py`.
+"""
 
 from __future__ import annotations
 

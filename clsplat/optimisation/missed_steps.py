@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors by which late Adam (--optimiser.late) makes up for the steps that a Gaussian missed while out of view."""
+"""Factors by which late Adam (--optimiser.late) makes up for the steps that a Gaussian missed while out of view.
+
+Steps that Adam refuses, as of values that are not finite: `kernels/shared/adam.h`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Penalties on opacity and scale, and the noise of MCMC, in a training step: parameters for the kernels."""
+"""Penalties on opacity and scale, and the noise of MCMC, in a training step: parameters for the kernels.
+
+Weights and the rate of the noise are settings: `config/training.py`.
+"""
 
 from __future__ import annotations
 

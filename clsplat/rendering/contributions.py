@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contributions of each Gaussian to the images of given cameras: the statistic for pruning in density control."""
+"""Contributions of each Gaussian to the images of given cameras: the statistic for pruning in density control.
+
+The pruning: `training/density/adaptive.py`; its threshold: `config/training.py`.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 """Checkpoint files: writing, reading and verifying the arrays and the JSON state of a training, in a zip file.
 
 `Trainer.checkpoint` decides what is in one; docs/architecture.md, "The run folder", lists it.
+`runs/run.py` decides how many are kept (KEPT_CHECKPOINTS).
 """
 
 from __future__ import annotations

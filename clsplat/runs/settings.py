@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings in config.toml: writing, reading and checking, also of files of earlier versions."""
+"""Settings in config.toml: writing, reading and checking, also of files of earlier versions.
+
+Settings that a resume cannot change: `check_resumed` in `runs/run.py`.
+"""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 DEPTH_FOLDERS = ("depths", "depth")
 """Names of the depth map folder, next to the photographs' folder or inside it."""
 MIN_DEPTH_FIT_POINTS = 10
-"""Minimum number of points in a photograph for a fit of its relative depth map."""
+"""Minimum number of points in a photograph for a fit of its relative depth map (disparities)."""
 MAX_DEPTH_SCALE_RATIO = 5.0
 """Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
 DEPTH_TO_UNIT = 1.4

@@ -18,7 +18,7 @@ DOWNSCALED_FOLDER_FACTORS = (2, 4, 8)
 FALLBACK_FOLDER_FACTORS = range(2, 65)
 """Factors of the folders of downscaled pictures that are used if there are no other pictures."""
 MAX_MISSING_FRACTION = 0.1
-"""Maximum fraction of the pictures that may be missing by default, as users delete some or do not copy all.
+"""Maximum fraction of missing pictures by default, as users delete some or do not copy all.
 
 If more pictures are missing, the folder may be the wrong one.
 """

@@ -31,8 +31,8 @@ Array = NDArray[Any]
 
 WHITENING_FACTOR = np.sqrt(0.5 * np.log2(np.e))
 MIN_DECISION_MARGIN = 1e-4
-"""Least relative distance of alpha and transmittance from their thresholds for a pixel to be compared. Nearer pixels
-depend on rounding. The distance is a hundred times the rounding error."""
+"""Margin: least relative distance of alpha and transmittance from their thresholds for a pixel to be compared. Nearer
+pixels depend on rounding. The distance is a hundred times the rounding error."""
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ from clsplat.sequence.task import (
 Result = tuple[Record, VideoPlanes | None]
 """Record of a frame, and the planes to encode if the frame belongs to a video."""
 WRITE_QUEUE_BYTES = 1 << 30
-"""Limit of main memory, in bytes, for frames in progress. At least (number of devices + 2) frames are allowed, whatever
-their size."""
+"""Limit of main memory, in bytes, for frames in flight: rendered, but not yet written. At least (number of devices + 2)
+frames are allowed, whatever their size."""
 ENCODING_COPIES = 3
 """Number of copies of a frame in memory while it is encoded: the rendered, the assembled and the converted frame."""
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera paths generated from a scene's cameras, with any number of frames: turntable, spiral and through."""
+"""Camera paths generated from a scene's cameras, with any number of frames: turntable, spiral and through.
+
+Default number of frames: `shots/read.py`. Up axis, and arcs that cameras cover: `shots/viewpoints.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Key frames of a camera and smooth interpolation between them.
 
-Positions and rotations follow cubic Hermite splines, scalars monotone cubics. docs/cameras.md (Between key frames)
-gives the reasons. `shots/readers` reads key frames from files.
+Positions and rotations follow cubic Hermite splines (not slerp), scalars monotone cubics. docs/cameras.md
+(Between key frames) gives the reasons. `shots/readers` reads key frames from files.
 """
 
 from __future__ import annotations

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras for motion vectors (one frame later or earlier) and for motion blur (while the shutter is open)."""
+"""Cameras for motion vectors (one frame later or earlier) and for motion blur (while the shutter is open).
+
+The time in which the shutter is open: `SamplingConfig.shutter` in `config/pictures.py`.
+"""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot, named, numbered, ph
 from clsplat.shots.viewpoints import COLMAP_UP
 
 DEFAULT_PATH_FRAMES = 120
-"""Default number of frames of a generated path: five seconds at 24 fps."""
+"""Default number of frames of a generated path such as a turntable: five seconds at 24 fps."""
 EXPECTED_CAMERA_SOURCES = (
     "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a cameras.json of a 3DGS training, a "
     "clsplat camera file (.json) or a USD stage"

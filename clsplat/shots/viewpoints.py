@@ -14,7 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 COLMAP_UP = (0.0, -1.0, 0.0)
-"""Up direction of a world that has the axes of a level camera, whose y axis points down in COLMAP's convention."""
+"""Up axis of a world that has the axes of a level camera, whose y axis points down in COLMAP's convention."""
 MAX_AZIMUTH_GAP_RADIANS = np.deg2rad(100.0)
 """Widest azimuth gap between cameras, in radians, that a turntable crosses. At wider gaps it swings back and forth."""
 

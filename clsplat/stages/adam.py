@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launches adam.cl for every parameter group. In a step of one view, `stages.project.project_step` updates the
-parameters instead."""
+parameters instead.
+
+Betas, epsilon and learning rates are settings: `OptimiserConfig` in `config/training.py`.
+"""
 
 from __future__ import annotations
 

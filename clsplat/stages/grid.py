@@ -16,7 +16,7 @@ from clsplat.device.profile import stage
 from clsplat.stages.appearance import APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON
 
 GRID_SHAPE = (8, 16, 16, 3, 4)
-"""Levels, rows and columns of a grid, then the shape of the colour transform in each cell."""
+"""Size of a bilateral grid: levels, rows and columns, then the shape of the colour transform in each cell."""
 GRID_FLOATS = int(np.prod(GRID_SHAPE))
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks and refusals of arguments (InputError), and conversions between tensors and arrays."""
+"""Checks and refusals of arguments (InputError), and conversions between tensors and arrays.
+
+Arguments of `rasterization` such as tile_size and camera_model, and which of them are refused: `torch/rendering.py`.
+"""
 
 from __future__ import annotations
 

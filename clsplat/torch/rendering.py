@@ -27,6 +27,7 @@ from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 HIT_DISTANCE_RENDER_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
 """Render modes that gsplat 1.6 supports only with `with_eval3d`."""
 GSPLAT_TILE_SIZE_PX = 16
+"""Default of tile_size, as in gsplat."""
 PACKED_ID_NAMES = ("batch_ids", "camera_ids", "gaussian_ids")
 """Names in `meta` of the arrays with each splat's batch, camera and Gaussian index."""
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning rates of the parameter groups by step: exponential decay of the means' rate, cooldown of all rates."""
+"""Learning rates of the parameter groups by step: exponential decay of the means' rate, cooldown of all rates.
+
+The rates themselves are settings: `OptimiserConfig` in `config/training.py`.
+"""
 
 from __future__ import annotations
 

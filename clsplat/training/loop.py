@@ -47,8 +47,8 @@ from clsplat.training.stability.health import MAX_CHECKPOINT_RETURNS, TROUBLE_WI
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
-"""Number of steps between reports, for which the host reads the loss. While it waits, the device continues with the
-rest of the step."""
+"""Number of steps between reports, and lines of metrics.jsonl, for which the host reads the loss. While it waits, the
+device continues with the rest of the step."""
 GROWTH_LIMIT_FRACTION = 0.97
 """Fraction of --density.max-gaussians from which growth counts as limited. It is below 1 because some Gaussians are
 pruned after the limit is reached."""
@@ -148,8 +148,9 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, unless the step has already changed the model.
 
-        Called after a failure of a kernel's trial or of the driver (such as a lost GPU), if device memory is used up,
-        and if a photograph cannot be read. Returns the end of an error message, which names the checkpoint, or "".
+        Called after a failure of a kernel's trial or of the driver (such as a lost GPU), if device memory is used up
+        (out of memory), and if a photograph cannot be read. Returns the end of an error message, which names the
+        checkpoint, or "".
         """
         if self.run is None:
             return ""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory of a training: plans of device memory, the limit of main memory (--max-host-mem), scratch files and cache."""
+"""Memory of a training: plans of device memory, the limit of main memory (--max-host-mem), scratch files and cache.
+
+A training that is out of memory ends by `TrainingSession.rescue` in `training/loop.py`.
+"""
 
 from __future__ import annotations
 

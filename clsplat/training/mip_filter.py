@@ -18,7 +18,7 @@ from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampl
 from clsplat.training.step.component import Component, Named
 
 SAMPLING_LIMIT_INTERVAL_STEPS = 100
-"""Number of steps between updates of the scales' lower limits. Means move too slowly to need more."""
+"""Number of steps between updates of the 3D filter, the scales' lower limits. Means move too slowly to need more."""
 
 
 class MipFilter(Component):

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records for a training's report in metrics.jsonl: device and versions, time of each stage, contributions."""
+"""Records for a training's report in metrics.jsonl: device and versions, time of each stage, contributions.
+
+The loop writes a line every REPORT_EVERY steps (`training/loop.py`).
+"""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Level:
 
 
 def next_scale(scale: float, seconds: float) -> float:
-    """Return the scale of a moving camera's next picture, after a picture of `scale` took `seconds`.
+    """Return the scale (resolution) of a moving camera's next picture, after a picture of `scale` took `seconds`.
 
     The scale changes in limited steps towards MOTION_PICTURE_SECONDS, because a part of the time does not depend on the
     number of pixels.

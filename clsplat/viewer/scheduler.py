@@ -3,6 +3,7 @@
 viser.
 
 Any thread may report a viewer's changes. Only `work` renders, on the thread that owns the device.
+`viewer/refinement.py` decides when, at which resolution, and for which part of a training's time.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 other servers' pages.
 
 The server sends viser's page and web socket messages, and no files of this machine.
+
+Default port: `config/cli_defaults.py`. Sizes and JPEG quality of pictures: `viewer/refinement.py`.
 """
 
 from __future__ import annotations

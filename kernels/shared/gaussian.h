@@ -4,8 +4,8 @@
 
 #include "shared/place.h"
 
-// LOW_PASS: variance added to the projected covariance, in px^2. LEAST_COMPENSATION: the minimum factor of the opacity
-// in equation (83) of docs/gradients.md.
+// LOW_PASS: dilation, the variance added to the projected covariance, in px^2. LEAST_COMPENSATION: the minimum factor
+// of the opacity (its compensation) in equation (83) of docs/gradients.md.
 #ifdef ANTIALIASED
 #define LOW_PASS 0.1f
 #define LEAST_COMPENSATION 0.005f

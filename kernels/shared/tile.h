@@ -1,6 +1,6 @@
 // Decides which tiles a projected Gaussian reaches. The kernels that count pairs and those that write pairs must both
 // use this code: if they disagreed by one tile, the pairs would overrun the arrays sized by the count, or leave gaps in
-// them.
+// them. The tile size is TILE of clsplat/layouts/columns.py.
 #include "shared/splat.h"
 
 // Slack in pixels by which ellipses are enlarged. It exceeds the rounding errors of float32 in this file: an extra tile

@@ -7,6 +7,8 @@ checksums of frames and gradients. Also write clsplat/selftest/digests.json, wit
 
 Run it and commit its files only after a change that is meant to change training, or the bits of frames or gradients;
 explain it in the commit. Without a name it writes all three files. The default device must support 16 lanes.
+
+tests/golden/README.md has the differences that the tests allow.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ a goal is missed, a prediction is too far off, the page is out of date, a loop o
 refuses a kernel.
 --inputs counts anew the inputs in docs/gpus/calibration.json, in the code that was measured, from the repository's
 history.
+`gpu_devices.py` computes the occupancy.
 """
 
 from __future__ import annotations

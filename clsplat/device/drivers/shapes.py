@@ -96,7 +96,8 @@ class Shape:
 
 
 def default_shape(device: cl.Device) -> Shape:
-    """The shape for the device's type and vector width (docs/decisions/0003-one-source-many-shapes.md)."""
+    """The shape (pixels per vector, work-group size) for the device's type and vector width
+    (docs/decisions/0003-one-source-many-shapes.md)."""
     if capabilities_of(device).kind != "cpu":
         items = next((n for n in (64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deterministic vector quantisation: codebooks of numbers and palettes of vectors."""
+"""Deterministic vector quantisation: codebooks of numbers and palettes of vectors.
+
+The number of entries: `models/formats/sog.py`.
+"""
 
 from __future__ import annotations
 

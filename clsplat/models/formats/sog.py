@@ -53,6 +53,7 @@ SOG_IMAGE_PREFIXES = ("means", "quats", "scales", "sh0", "shN")
 """Prefixes of the images' names."""
 SH_IMAGE_FILES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE_ENTRIES = 1 << 16
+"""Maximum number of entries of the palette of SH coefficients, which k-means makes (`models.codec.palette`)."""
 PALETTE_COLUMNS = 64
 QUATERNION_TAG_BASE = 252
 MAX_UNCHECKED_IMAGE_BYTES = 16 << 20

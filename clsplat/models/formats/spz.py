@@ -47,7 +47,7 @@ SPZ_VERSIONS = (2, 3, 4)
 DEFAULT_SPZ_VERSION = 3
 """Version that most web readers accept (docs/formats.md). Niantic's library and splat-transform write 4."""
 DEFAULT_SH_BITS = (6, 6)
-"""Numbers of bits to which SH coefficients are rounded: in band 1, and in the higher bands. Files do not record them.
+"""Numbers of bits to which SH coefficients are quantised: in band 1, and in the higher bands. Files do not record them.
 
 Niantic's library keeps 5 and 4 bits. Its files are a fifth smaller, but renders of a trained model with strong view
 dependence are 11 dB worse, at 36 dB (docs/formats.md).

@@ -4,6 +4,8 @@
 `pycolmap.Reconstruction` is not used, because version 4.2.1 does not handle damaged files. It fails without naming the
 file, allocates all memory, or accepts a truncated cameras.bin and goes on with uninitialised data. This reader rejects
 files with missing or additional bytes.
+
+Camera models: `colmap_camera_models` in `scenes/dataset.py`.
 """
 
 from __future__ import annotations

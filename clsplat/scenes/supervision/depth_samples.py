@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths of one view, from points or a depth map: their pixels and inverse depths, for the depth loss."""
+"""Known depths of one view, from points or a depth map: their pixels and inverse depths, for the depth loss.
+
+Scales of relative depth maps are fitted in `scenes/depth_sources.py`.
+"""
 
 from __future__ import annotations
 

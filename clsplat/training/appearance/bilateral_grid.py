@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bilateral grids, one for each training photograph, learnt with the model: gradient, Adam's step, and checkpoints."""
+"""Bilateral grids, one for each training photograph, learnt with the model: gradient, Adam's step, and checkpoints.
+
+The size of a grid: `stages/grid.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning rate of appearance (gains, grids) by step, and the appearance arrays of a checkpoint."""
+"""Learning rate of appearance (gains, grids) by step, and the appearance arrays of a checkpoint.
+
+Adam's betas and epsilon for appearance: `stages/appearance.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera refinement: gradients with respect to poses and lenses, and validation of cameras on held-out views."""
+"""Camera refinement: gradients with respect to poses and lenses, and validation of cameras on held-out views.
+
+The first step of a refinement: `first_step` in `training/cameras/poses.py`.
+"""
 
 from __future__ import annotations
 

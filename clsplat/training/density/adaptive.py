@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Uses no OpenCL."""
+"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Uses no OpenCL.
+
+Steps and thresholds are settings: `DensityConfig` in `config/training.py`.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@
 Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike there, the model grows by halving
 the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). `optimisation.step_noise` has
 the noise of each step. Uses no OpenCL.
+Its settings: `DensityConfig` in `config/training.py`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the views in an epoch, a pass through the training photographs (--view-order). Uses no OpenCL.
 
-A pass shows each view once. Its order is random, or alternates between four clusters of views. The views of a cluster
-look at points that are near each other.
+A pass shows each view once. Its order is random (a shuffle), or alternates between four clusters of views. The views
+of a cluster look at points that are near each other.
 """
 
 from __future__ import annotations

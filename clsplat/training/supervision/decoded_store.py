@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cache of decoded photographs on the disk (--cache): a file for each photograph and size, with the same pixels.
+"""Disk cache of decoded photographs (--cache): a file for each photograph and size, with the same pixels.
 
 A file has a header and the pixels. The header has the shape, the type, a key and a checksum of header and pixels. The
 key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, because

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoding of photographs to the sizes that the warm-up needs, or reading of their decoded pixels from the disk cache.
-Uses no OpenCL."""
+Uses no OpenCL.
+
+Threads that read ahead: `host_photographs.py`. The cache: `decoded_store.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths of the training views, which the depth loss compares with rendered depths."""
+"""Known depths of the training views, which the depth loss compares with rendered depths.
+
+The weight of the depth loss: `config/training.py`; its fall: `config/depth.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs on the device: kept there as far as memory allows, otherwise uploaded step by step."""
+"""Photographs on the device: kept there as far as memory allows, otherwise uploaded step by step.
+
+Main memory: `host_photographs.py`. The cache on the disk: `decoded_store.py`.
+"""
 
 from __future__ import annotations
 
