@@ -14,6 +14,8 @@
 //   nearness (height, width), with NEARNESS: the sum of weight / depth; 0 in padding.
 //   cells_from_sorted (pairs), with RECORD_CELLS: bits of the cells to which the Gaussian contributes, for
 //     blend_grad.cl.
+//   states, tile_of_state (pairs / PART_PAIRS, ...), with PART_PAIRS: where blend_grad.cl begins within a list
+//     (shared/parts.h).
 //   Planes are padded with black to whole tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.
@@ -25,6 +27,7 @@
 #include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
+#include "shared/parts.h"
 
 #ifdef NO_EARLY_STOP // RasterizerConfig.early_stop is off: continue past opaque pixels, with the same result
 #define GOES_ON(open) 1
@@ -120,6 +123,10 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
                           ,
                           __global uint *cells_from_sorted
 #endif
+#ifdef PART_PAIRS
+                          ,
+                          __global float *states, __global uint *tile_of_state
+#endif
 #ifdef RAYS
                           ,
                           __constant float *camera
@@ -196,6 +203,10 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   __local uint *list = lists + WARP * LIST;
   const int zero = min(pixels[0].stop + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
+#ifdef PART_PAIRS
+  for (int state = FIRST_STATE(begin) + ITEM; state < FIRST_STATE(end); state += ITEMS)
+    tile_of_state[state] = listed_tile;
+#endif
   BARRIER_LOCAL();
   // Indices for the next batch, loaded early: loads of its splats need not wait for them.
   uint gaussian_of[FETCHES];
@@ -209,6 +220,20 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
     const uint live = blocks_above(0, open_in);
     if (live == 0) break;
+#ifdef PART_PAIRS
+    if (batch > begin && (batch - begin) % PART_PAIRS == 0) {
+      const int state = FIRST_STATE(begin) + (batch - begin) / PART_PAIRS - 1;
+      ALL_CELLS(cell) {
+        IN_STATE(state, STATE_T, cell) = pixels[cell].t;
+        IN_STATE(state, STATE_RED, cell) = pixels[cell].red;
+        IN_STATE(state, STATE_GREEN, cell) = pixels[cell].green;
+        IN_STATE(state, STATE_BLUE, cell) = pixels[cell].blue;
+#ifdef NEARNESS
+        IN_STATE(state, STATE_NEAR, cell) = pixels[cell].near;
+#endif
+      }
+    }
+#endif
     FOR_FETCHES(fetch) {
       const int j = ITEM + fetch * ITEMS;
       const uint gaussian = gaussian_of[fetch], among = batch + j < end ? live : 0;

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,37 @@ BLEND_PIXEL_BYTES = 20
 def gradient_pair_bytes(fields: SlotFields) -> int:
     """Bytes per pair that the gradient of blending needs: the pair's cells and its slot."""
     return 4 + 4 * fields.floats
+
+
+PART_PAIRS = 512
+"""Number of pairs of a list that a group of several items walks in the gradient of blending. A longer list is divided
+between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
+
+
+@dataclass(frozen=True, eq=False)
+class ListParts:
+    """Where groups of the gradient of blending begin within long lists (kernels/shared/parts.h).
+
+    states: (boundaries, 4, TILE * TILE), transmittance and colour of a tile's pixels at each boundary; with nearness
+    (boundaries, 5, TILE * TILE).
+    tile_of_state: (boundaries), the tile of the band that owns each state.
+    """
+
+    states: DeviceArray
+    tile_of_state: DeviceArray
+
+    @property
+    def boundaries(self) -> int:
+        return self.states.shape[0]
+
+    @property
+    def arrays(self) -> tuple[DeviceArray, DeviceArray]:
+        return self.states, self.tile_of_state
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """The defines of kernels that take `arrays`."""
+        return {"PART_PAIRS": PART_PAIRS, "STATE_SIZE": self.states.shape[1]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +84,7 @@ class Blended:
     stops: (rows, stride) int32, the sorted index of the first pair that is not added to the pixel; -1 in padding.
     cells_from_sorted: (pairs) uint32, the cells in which each pair's Gaussian contributes, as bits; or None.
     nearness: (rows, stride), the sum of weight / depth, if requested.
+    parts: the boundaries within the lists of the last band, or None.
     """
 
     image: DeviceArray
@@ -60,6 +92,7 @@ class Blended:
     stops: DeviceArray
     cells_from_sorted: DeviceArray | None
     nearness: DeviceArray | None = None
+    parts: ListParts | None = None
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
@@ -159,18 +192,41 @@ def launch_tiles(
     kernel: str = "",
     items: int | None = None,
     registers: int = 0,
+    more: int = 0,
 ) -> None:
     """Launch a kernel of `stem`.cl, with one group per tile of the lists.
 
     kernel: the kernel's name, if it is not `stem`.
     items: number of work-items that share a tile; None for `tile_items`.
     registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
+    more: number of further groups.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
     items = items or tile_items(device)
     built = getattr(device.kernels(stem, {"ITEMS": items, **defines}, registers), kernel or stem)
-    launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
+    launch_groups(device, built, lists.band.tiles + more, items, lists.band.first, tiles_x, *arguments)
+
+
+def _divides(device: Device) -> bool:
+    """True if groups of the gradient share long lists."""
+    return tile_items(device) > 1 and not _by_gaussian(device)
+
+
+def _by_gaussian(device: Device) -> bool:
+    """True if each item of the gradient's groups owns Gaussians."""
+    return device.shape.by_gaussian and not device.switched("RAYS")
+
+
+def _rays(device: Device, inputs: ImageInputs) -> DeviceArray | None:
+    """The camera, if Gaussians are evaluated along the rays of pixels."""
+    return inputs.camera_array if device.switched("RAYS") else None
+
+
+def _list_parts(work: Workspace, lists: TileLists, *, nearness: bool) -> ListParts:
+    boundaries = lists.gaussian_from_sorted.shape[0] // PART_PAIRS
+    states = work.array("list_states", (boundaries, 5 if nearness else 4, TILE * TILE))
+    return ListParts(states, work.array("tile_of_state", (boundaries,), np.uint32))
 
 
 @stage("blend")
@@ -188,25 +244,36 @@ def blend(
 
     Pixels of other tiles are left unchanged.
 
-    record: also fill `cells_from_sorted`, by which the gradient skips cells, if the kernel shape supports it.
+    record: also fill the arrays of `Blended` that make the gradient quicker, as far as the kernel shape has them.
     nearness: also blend 1 / depth.
     items: number of work-items that share a tile; None for `frame_items`.
     """
-    width, height = inputs.width, inputs.height
-    planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
+    planes, near = _planes(work, inputs.width, inputs.height, kept=lists.band.first > 0), None
     if nearness:
-        near = work.array("nearness", padded_size(width, height), kept=lists.band.first > 0)
-    cells, rays = None, device.switched("RAYS")
-    if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
+        near = work.array("nearness", padded_size(inputs.width, inputs.height), kept=lists.band.first > 0)
+    cells = parts = None
+    if record and not device.switched("RAYS") and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
-    extra = ([near] if near else []) + ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
-    extra += [lists.order] if lists.order else []
+    if record and _divides(device):
+        parts = _list_parts(work, lists, nearness=nearness)
+    blended = Blended(*planes, cells, near, parts)
+    _fill(device, lists, inputs, blended, items or frame_items(device, lists.band.tiles))
+    return blended
+
+
+def _fill(device: Device, lists: TileLists, inputs: ImageInputs, blended: Blended, items: int) -> None:
+    """Fill the arrays of `blended` for the tiles of the lists."""
+    near, cells, parts = blended.nearness, blended.cells_from_sorted, blended.parts
+    planes = (blended.image, blended.transmittance, blended.stops)
+    extra = [
+        array for array in (near, cells, *(parts.arrays if parts else ()), _rays(device, inputs), lists.order) if array
+    ]
     arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
     switches = (("NEARNESS", near), ("RECORD_CELLS", cells), ("TILE_ORDER", lists.order))
-    defines = {name: True for name, on in switches if on}
-    items = items or frame_items(device, lists.band.tiles)
-    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays, items=items)
-    return Blended(*planes, cells, near)
+    defines = {**{name: True for name, on in switches if on}, **(parts.defines if parts else {})}
+    launch_tiles(
+        device, "blend", defines, lists, -(-inputs.width // TILE), inputs.width, inputs.height, *arrays, items=items
+    )
 
 
 def count_pairs(
@@ -231,6 +298,18 @@ def count_pairs(
     return int(contributing), int(evaluated)
 
 
+def _divided(
+    device: Device, work: Workspace, lists: TileLists, inputs: ImageInputs, blended: Blended, *, nearness: bool
+) -> Blended:
+    """Blend the tiles of the lists again, for the parts of the lists. They were not kept, or belong to another band."""
+    near = blended.nearness
+    if nearness and near is None:
+        near = work.array("nearness", blended.transmittance.shape)
+    again = replace(blended, nearness=near, parts=_list_parts(work, lists, nearness=near is not None))
+    _fill(device, lists, inputs, again, frame_items(device, lists.band.tiles))
+    return again
+
+
 @stage("blend_grad")
 def blend_grad(
     device: Device,
@@ -252,20 +331,37 @@ def blend_grad(
     slots = work.array("slots", (pairs, fields.floats))
     if pairs == 0:
         return slots
-    cells, rays = blended.cells_from_sorted, device.switched("RAYS")
+    if _divides(device) and (blended.parts is None or (fields.nearness and blended.nearness is None)):
+        blended = _divided(device, work, lists, inputs, blended, nearness=fields.nearness)
+    cells, parts = blended.cells_from_sorted, blended.parts
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
-    if device.shape.by_gaussian and not rays:
+    if _by_gaussian(device):
         defines["BY_GAUSSIAN"] = True
     if image_gradient.shape[0] - fields.nearness == 4:
         defines["ALPHA_GRADIENT"] = True
     if lists.order:
         defines["TILE_ORDER"] = True
+    divided: tuple[Any, ...] = ()
+    if parts:
+        defines |= {**parts.defines, **lists.elements.defines}
+        divided = (parts.boundaries, *lists.elements.arguments, blended.image, *parts.arrays)
+        divided += (blended.nearness,) if fields.nearness else ()
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
-    extra = ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
-    extra += [lists.order] if lists.order else []
-    arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *extra)
+    extra = [array for array in (_rays(device, inputs), lists.order) if array]
+    arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *([cells] if cells else []), *divided, *extra)
     items = gradient_items(device, lists.band.tiles)
     most = _GRADIENT_REGISTERS.get(items, 0)
-    launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays, items=items, registers=most)
+    launch_tiles(
+        device,
+        "blend_grad",
+        defines,
+        lists,
+        stride // TILE,
+        rows,
+        *arrays,
+        items=items,
+        registers=most,
+        more=parts.boundaries if parts else 0,
+    )
     return slots
