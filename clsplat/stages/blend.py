@@ -22,14 +22,15 @@ BLEND_PIXEL_BYTES = 20
 """Bytes per pixel of `Blended`, padding included: image, transmittance and stop."""
 
 
-def gradient_pair_bytes(fields: SlotFields) -> int:
-    """Bytes per pair that the gradient of blending needs: the pair's cells and its slot."""
-    return 4 + 4 * fields.floats
-
-
 PART_PAIRS = 512
 """Number of pairs of a list that a group of several items walks in the gradient of blending. A longer list is divided
 between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
+
+
+def gradient_pair_bytes(device: Device, fields: SlotFields) -> int:
+    """Bytes per pair that the gradient of blending needs: the pair's slot, and its cells or its share of a state."""
+    cells, state = 4, 4 * (4 + fields.nearness) * TILE * TILE + 4
+    return 4 * fields.floats + (cells if tile_items(device) == 1 else -(-state // PART_PAIRS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +106,6 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
     )
 
 
-_MIN_STRIP_ITEMS = 32
-"""Number of work-items per tile from which sums over a tile's pixels are in the order of kernels/shared/strips.h."""
 _MIN_TILE_ITEMS = 8
 """Minimum number of work-items that share a tile: those of one row of a pixel block (kernels/shared/blocks.h). A tile
 that is not shared has one work-item."""
@@ -122,14 +121,6 @@ def tile_items(device: Device) -> int:
 _BUSY_ITEMS = 4096
 """Number of work-items per compute unit above which larger groups in `blend` only add instructions. It is 16 tiles of
 256 work-items or 32 of 128, as predicted for NVIDIA's GPUs (docs/gpu-static.md)."""
-
-
-_GRADIENT_TILES = 12
-"""Number of tiles per compute unit up to which `blend_grad` is quicker in groups of 256 than in groups of 64.
-
-The limit is a prediction for NVIDIA's GPUs. The scene fox, with 11 tiles per unit, takes 0.52 ms instead of 0.62. A
-frame with 13 tiles per unit and shorter lists takes 0.18 ms instead of 0.17. Groups of 128 are slower than 64 in both.
-"""
 
 
 def frame_items(device: Device, tiles: int) -> int:
@@ -154,26 +145,6 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
     while 2 * items <= most and 2 * items * tiles <= _BUSY_ITEMS * units:
         items *= 2
     return items
-
-
-def gradient_items(device: Device, tiles: int) -> int:
-    """Number of work-items that share a tile in `blend_grad`, in a frame of `tiles` tiles. All numbers of 32 or more
-    give the same bits."""
-    items = tile_items(device)
-    if device.kind != "gpu" or items < _MIN_STRIP_ITEMS or device.shape.by_gaussian:
-        return items
-    return gradient_items_for(tiles, int(device.cl_device.max_compute_units), items, device.max_group)
-
-
-def gradient_items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """Return the work-items of a group for `gradient_items`, on a GPU.
-
-    tiles: number of tiles of the picture.
-    units: number of the GPU's compute units.
-    items: work-items of a group by the kernel shape.
-    most: maximum number of work-items in a group.
-    """
-    return TILE * TILE if tiles <= _GRADIENT_TILES * units and most >= TILE * TILE else items
 
 
 _GRADIENT_REGISTERS = {64: 96}
@@ -350,8 +321,7 @@ def blend_grad(
     planes = (image_gradient, blended.transmittance, blended.stops)
     extra = [array for array in (_rays(device, inputs), lists.order) if array]
     arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *([cells] if cells else []), *divided, *extra)
-    items = gradient_items(device, lists.band.tiles)
-    most = _GRADIENT_REGISTERS.get(items, 0)
+    most = _GRADIENT_REGISTERS.get(tile_items(device), 0)
     launch_tiles(
         device,
         "blend_grad",
@@ -360,7 +330,6 @@ def blend_grad(
         stride // TILE,
         rows,
         *arrays,
-        items=items,
         registers=most,
         more=parts.boundaries if parts else 0,
     )
