@@ -1,9 +1,9 @@
 // The gradient of alpha blending, back to front: sums over a tile's pixels, for each pair of a tile and a Gaussian.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs. No two share a slot, so there are no atomics.
-// Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
-//   BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend.cl's inputs; blend.cl's outputs transmittance and stops; slot_from_sorted (pairs).
+// Owner: A group owns a tile, or with PART_PAIRS a part of its list, and writes a slot for each pair. No two share a slot.
+// Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on; with PART_PAIRS first one for
+//   each state (shared/parts.h). An item owns pixels; with BY_GAUSSIAN it owns one Gaussian after another.
+// Buffers: blend.cl's inputs; blend.cl's outputs, without PART_PAIRS transmittance and stops; slot_from_sorted (pairs).
 //   image_gradient (3, height, width): the loss's gradient with respect to colour. ALPHA_GRADIENT adds a fourth plane,
 //     with respect to the final transmittance. NEARNESS adds a last plane, with respect to nearness.
 //   -> slots (pairs, SLOT_STRIDE): sums over the tile's pixels, in the whitened units of (49); every slot is written.
