@@ -12,8 +12,8 @@
 //   -> image (3, height, width): colour. transmittance (height, width): after all Gaussians, 0 to 1.
 //   stops (height, width): the sorted index of the first pair that is not added to the pixel; -1 in padding.
 //   nearness (height, width), with NEARNESS: the sum of weight / depth; 0 in padding.
-//   For blend_grad.cl: cells_from_sorted (pairs), with RECORD_CELLS: bits of the cells to which the Gaussian contributes.
-//   states, tile_of_state (pairs / PART_PAIRS, ...), with PART_PAIRS (shared/parts.h).
+//   For blend_grad.cl: with RECORD_CELLS cells_from_sorted (pairs), bits of the cells to which the Gaussian
+//     contributes; with PART_PAIRS states, tile_of_state (shared/parts.h).
 //   Planes are padded with black to whole tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.

@@ -1,6 +1,6 @@
 // The gradient of alpha blending, back to front: sums over a tile's pixels, for each pair of a tile and a Gaussian.
 //
-// Owner: A group owns a tile, or with PART_PAIRS a part of its list, and writes a slot for each pair. No two share a slot.
+// Owner: A group owns a tile, with PART_PAIRS a part of its list, and writes a slot for each pair. No two share a slot.
 // Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on; with PART_PAIRS first one for
 //   each state (shared/parts.h). An item owns pixels; with BY_GAUSSIAN it owns one Gaussian after another.
 // Buffers: blend.cl's inputs; blend.cl's outputs, without PART_PAIRS transmittance and stops; slot_from_sorted (pairs).
