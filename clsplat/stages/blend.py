@@ -47,15 +47,17 @@ class ListParts:
 
     @property
     def boundaries(self) -> int:
+        """Number of boundaries for which there is room."""
         return self.states.shape[0]
 
     @property
-    def arrays(self) -> tuple[DeviceArray, DeviceArray]:
-        return self.states, self.tile_of_state
+    def arguments(self) -> tuple[Any, Any]:
+        """Kernel arguments. They are buffers, so that a stage's bytes leave them out: few of theirs are used."""
+        return self.states.buffer, self.tile_of_state.buffer
 
     @property
     def defines(self) -> dict[str, object]:
-        """The defines of kernels that take `arrays`."""
+        """The defines of kernels that take `arguments`."""
         return {"PART_PAIRS": PART_PAIRS, "STATE_SIZE": self.states.shape[1]}
 
 
@@ -236,9 +238,8 @@ def _fill(device: Device, lists: TileLists, inputs: ImageInputs, blended: Blende
     """Fill the arrays of `blended` for the tiles of the lists."""
     near, cells, parts = blended.nearness, blended.cells_from_sorted, blended.parts
     planes = (blended.image, blended.transmittance, blended.stops)
-    extra = [
-        array for array in (near, cells, *(parts.arrays if parts else ()), _rays(device, inputs), lists.order) if array
-    ]
+    extra: list[Any] = [array for array in (near, cells) if array]
+    extra += [*(parts.arguments if parts else ()), *(array for array in (_rays(device, inputs), lists.order) if array)]
     arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
     switches = (("NEARNESS", near), ("RECORD_CELLS", cells), ("TILE_ORDER", lists.order))
     defines = {**{name: True for name, on in switches if on}, **(parts.defines if parts else {})}
@@ -315,8 +316,8 @@ def blend_grad(
     divided: tuple[Any, ...] = ()
     if parts:
         defines |= {**parts.defines, **lists.elements.defines}
-        divided = (parts.boundaries, *lists.elements.arguments, blended.image, *parts.arrays)
-        divided += (blended.nearness,) if fields.nearness else ()
+        seen = [array.buffer for array in (blended.image, blended.nearness if fields.nearness else None) if array]
+        divided = (parts.boundaries, *lists.elements.arguments, seen[0], *parts.arguments, *seen[1:])
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
     extra = [array for array in (_rays(device, inputs), lists.order) if array]
