@@ -134,6 +134,12 @@ def test_groups_of_32_to_256_items_have_the_same_bits(default_device: Device, va
         assert_same_bits(each, first)
 
 
+def test_every_driver_and_every_run_have_the_same_bits(device: Device, default_device: Device) -> None:
+    scene = listed(1500, WALLS, 2)
+    got, wanted = (slots_of(Pipeline.run(shaped(each, 1, 64), scene), "colour") for each in (device, default_device))
+    assert_same_bits(got, wanted)
+
+
 @pytest.mark.parametrize("appends", [True, False])
 def test_a_pass_by_capacity_has_the_same_bits(device: Device, appends: bool) -> None:
     """Its arrays are too large, and hold the states of a pass with more pairs."""
