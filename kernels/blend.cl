@@ -12,8 +12,8 @@
 //   -> image (3, height, width): colour. transmittance (height, width): after all Gaussians, 0 to 1.
 //   stops (height, width): the sorted index of the first pair that is not added to the pixel; -1 in padding.
 //   nearness (height, width), with NEARNESS: the sum of weight / depth; 0 in padding.
-//   cells_from_sorted (pairs), with RECORD_CELLS: bits of the cells to which the Gaussian contributes, for
-//     blend_grad.cl.
+//   For blend_grad.cl: with RECORD_CELLS cells_from_sorted (pairs), bits of the cells to which the Gaussian
+//     contributes; with PART_PAIRS states, tile_of_state (shared/parts.h).
 //   Planes are padded with black to whole tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.
@@ -25,6 +25,7 @@
 #include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
+#include "shared/parts.h"
 
 #ifdef NO_EARLY_STOP // RasterizerConfig.early_stop is off: continue past opaque pixels, with the same result
 #define GOES_ON(open) 1
@@ -120,6 +121,10 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
                           ,
                           __global uint *cells_from_sorted
 #endif
+#ifdef PART_PAIRS
+                          ,
+                          __global float *states, __global uint *tile_of_state
+#endif
 #ifdef RAYS
                           ,
                           __constant float *camera
@@ -196,6 +201,10 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   __local uint *list = lists + WARP * LIST;
   const int zero = min(pixels[0].stop + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
+#ifdef PART_PAIRS
+  for (int state = FIRST_STATE(begin) + ITEM; state < FIRST_STATE(end); state += ITEMS)
+    tile_of_state[state] = listed_tile;
+#endif
   BARRIER_LOCAL();
   // The indices for the next batch are loaded early, so that the loads of its splats need not wait for them.
   uint gaussian_of[FETCHES];
@@ -209,6 +218,20 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
     const uint live = blocks_above(0, open_in);
     if (live == 0) break;
+#ifdef PART_PAIRS
+    if (batch > begin && (batch - begin) % PART_PAIRS == 0) {
+      const int state = FIRST_STATE(begin) + (batch - begin) / PART_PAIRS - 1;
+      ALL_CELLS(cell) {
+        IN_STATE(state, STATE_T, cell) = pixels[cell].t;
+        IN_STATE(state, STATE_RED, cell) = pixels[cell].red;
+        IN_STATE(state, STATE_GREEN, cell) = pixels[cell].green;
+        IN_STATE(state, STATE_BLUE, cell) = pixels[cell].blue;
+#ifdef NEARNESS
+        IN_STATE(state, STATE_NEAR, cell) = pixels[cell].near;
+#endif
+      }
+    }
+#endif
     FOR_FETCHES(fetch) {
       const int j = ITEM + fetch * ITEMS;
       const uint gaussian = gaussian_of[fetch], among = batch + j < end ? live : 0;

@@ -1,9 +1,9 @@
 // The gradient of alpha blending, back to front: sums over a tile's pixels, for each pair of a tile and a Gaussian.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs. No two share a slot, so there are no atomics.
-// Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
-//   BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend.cl's inputs; blend.cl's outputs transmittance and stops; slot_from_sorted (pairs).
+// Owner: A group owns a tile, with PART_PAIRS a part of its list, and writes a slot for each pair. No two share a slot.
+// Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on; with PART_PAIRS first one for
+//   each state (shared/parts.h). An item owns pixels; with BY_GAUSSIAN it owns one Gaussian after another.
+// Buffers: blend.cl's inputs; blend.cl's outputs, without PART_PAIRS transmittance and stops; slot_from_sorted (pairs).
 //   image_gradient (3, height, width): the loss's gradient with respect to colour. ALPHA_GRADIENT adds a fourth plane,
 //     with respect to the final transmittance. NEARNESS adds a last plane, with respect to nearness.
 //   -> slots (pairs, SLOT_STRIDE): sums over the tile's pixels, in the whitened units of (49); every slot is written.
@@ -25,6 +25,7 @@
 #include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
+#include "shared/parts.h"
 
 #ifdef CONTRIBUTIONS // contributions are summed over all cells, also over cells without a gradient
 #define LIVE(cells, live) (cells)
@@ -90,44 +91,7 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
 #endif
 }
 
-#ifdef RAYS
-// Adds a pixel to the sums along rays: SLOT_GU and SLOT_GV get the gradient with respect to the mean on its tangent
-// plane. It is not linear in (u, v), because the plane turns with the mean: equation (21) of docs/cameras.md.
-static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
-  const floatL q = fmaL(u, u, v * v);
-  const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;
-  const floatL by_x = g * fmaL(q, x, l11 * u), by_y = g * fmaL(q, y, fmaL((floatL)(l12), u, l22 * v));
-  add_moments_by(g, u, v, by_x, by_y, sums);
-#ifdef ABSOLUTE_GRADIENTS
-  sums[SLOT_ABSX] += fabs(by_x);
-  sums[SLOT_ABSY] += fabs(by_y);
-#endif
-}
-#endif
-
-// Adds the gradients of one vector of pixels to a pair's sums (SLOT_STRIDE). place: the vector's index among the cells.
-#define IN_PLACE(cells, place) (((const floatS *)(cells))[place])
-static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floatS g, floatS weight, floatS u, floatS v,
-                                 float l11, float l12, float l22) {
-  sums[SLOT_RED] = fmaS(weight, IN_PLACE(p->red, place), sums[SLOT_RED]);
-  sums[SLOT_GREEN] = fmaS(weight, IN_PLACE(p->green, place), sums[SLOT_GREEN]);
-  sums[SLOT_BLUE] = fmaS(weight, IN_PLACE(p->blue, place), sums[SLOT_BLUE]);
-#ifdef RAYS
-  add_ray_moments(g, u, v, l11, l12, l22, sums);
-#else
-  add_moments(g, u, v, sums);
-#ifdef ABSOLUTE_GRADIENTS
-  sums[SLOT_ABSX] += fabs(g * (l11 * u));
-  sums[SLOT_ABSY] += fabs(g * fmaS((floatS)(l12), u, l22 * v));
-#endif
-#endif
-#ifdef CONTRIBUTIONS
-  sums[SLOT_WEIGHT] += weight;
-#endif
-#ifdef NEARNESS
-  sums[SLOT_NEAR] = fmaS(weight, IN_PLACE(p->near, place), sums[SLOT_NEAR]);
-#endif
-}
+#include "shared/pair_sums.h"
 
 // Gradient with respect to the final transmittance: `background`, its part through colour, + by_t, the fourth plane.
 #ifdef ALPHA_GRADIENT
@@ -218,12 +182,26 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
                                           ,
                                           __global const uint *cells_from_sorted
 #endif
+#ifdef PART_PAIRS
+                                          ,
+                                          const int most_states, ELEMENTS(pairs), __global const float *image,
+                                          __global const float *states, __global const uint *tile_of_state
+#ifdef NEARNESS
+                                          ,
+                                          __global const float *nearness
+#endif
+#endif
 #ifdef RAYS
                                           ,
                                           __constant float *camera
 #endif
                                               TILE_ORDER_PARAMETER) {
+#ifdef PART_PAIRS
+  FIND_ELEMENTS(pairs)
+  PART_OF_GROUP
+#else
   TILE_OF_GROUP
+#endif
   int last = begin;
 #ifdef BY_GAUSSIAN
   __local Passing passing[TILE * TILE];
@@ -275,6 +253,24 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     const floatL behind = BEHIND(t, AT_END(red * background[0] + green * background[1] + blue * background[2]));
     pixels.t[cell] = t;
     pixels.behind[cell] = behind;
+#ifdef PART_PAIRS
+    if (stop > end) { // the pixel goes on past the boundary at which the group begins
+#ifdef ALPHA_GRADIENT
+      float light = by_t * t;
+#else
+      float light = 0.0f;
+#endif
+#ifdef NEARNESS
+      light =
+          fma1(image_gradient[NEAR_PLANE * plane + pixel], nearness[pixel] - IN_STATE(state, STATE_NEAR, cell), light);
+#endif
+      light = fma1(blue, image[2 * plane + pixel] - IN_STATE(state, STATE_BLUE, cell), light);
+      light = fma1(green, image[plane + pixel] - IN_STATE(state, STATE_GREEN, cell), light);
+      light = fma1(red, image[pixel] - IN_STATE(state, STATE_RED, cell), light);
+      pixels.t[cell] = IN_STATE(state, STATE_T, cell);
+      pixels.behind[cell] = quotient(light, pixels.t[cell]);
+    }
+#endif
     pixels.red[cell] = red;
     pixels.green[cell] = green;
     pixels.blue[cell] = blue;
@@ -295,6 +291,9 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   }
 #endif
   RAISE_TO_GROUP_MAX(last)
+#ifdef PART_PAIRS
+  last = min(last, end);
+#endif
 
   // Every pair from `last` on contributes to no pixel, and its slot becomes 0. There is no early exit, because Intel's
   // runtime reads memory for idle items too.

@@ -21,6 +21,7 @@ from clsplat.rendering.build_flags import DEFAULT_ALPHA_MAX
 from clsplat.stages.duplicate import Band
 from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
+from clsplat.stages.scan import Elements
 from clsplat.stages.splats import ScreenGaussians, splats
 
 
@@ -320,7 +321,7 @@ def _listed(
     first_slots = np.cumsum(by_gaussian) - by_gaussian
     words = (np.ascontiguousarray(of, np.uint32) for of in (ranges, listed, slots, by_gaussian, first_slots))
     ranges_, listed_, slots_, counts_, first_ = (upload(device, word) for word in words)
-    tile_lists = TileLists(Band(0, len(lists.begins)), ranges_, listed_, slots_)
+    tile_lists = TileLists(Band(0, len(lists.begins)), ranges_, listed_, slots_, Elements(len(listed)))
     return Listed(Projected(drawn.splats, counts_), tile_lists, first_)
 
 

@@ -105,7 +105,7 @@ def plan_step(
         row=frame.row + screen + statistics + (_VISIBLE_MARK_BYTES if models > MODELS else 0) + step.row_bytes,
         banded=frame.banded + 4 * fields.floats,
         model=models * frame.model,
-        pair=frame.pair + blend.gradient_pair_bytes(fields) + (append.APPEND_PAIR_BYTES if appends else 0),
+        pair=frame.pair + blend.gradient_pair_bytes(device, fields) + (append.APPEND_PAIR_BYTES if appends else 0),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS_PER_BAND),
         photographs=0
         if device.shares_memory

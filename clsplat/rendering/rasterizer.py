@@ -23,7 +23,7 @@ from clsplat.optimisation.dropout import Thinning
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.append import MAX_MEAN_PAIRS, append, appends
-from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad
+from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad, tile_items
 from clsplat.stages.channels import Channels, Features, Floats, Motion, channels, features
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
@@ -230,7 +230,7 @@ class Rasterizer:
             gaussians, chunks = self._in_view(gaussians, gaussians.pool, camera)
         camera_array, colours = background if isinstance(background, tuple) else self.send(camera, background)
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
-        records = backward and self._switches.record_cells
+        records = backward and (self._switches.record_cells or tile_items(device) > 1)
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
             projected = project(device, work, gaussians, camera, camera_array, thinning, chunks)

@@ -85,5 +85,6 @@ def append(
     local, sharing = cl.LocalMemory(8 * LOCAL_PAIRS), frame_items(device, number)
     sort = device.kernels("append", {"ITEMS": sharing}).sort_lists
     launch_groups(device, sort, number, sharing, LOCAL_PAIRS, *arrays, local)
-    lists = TileLists(Band(0, number), ranges, gaussian_from_sorted, slot_from_sorted, order)
-    return Totals(tile_counts, slots, n, capacity, on_device=readback, arriving=arriving), lists
+    totals = Totals(tile_counts, slots, n, capacity, on_device=readback, arriving=arriving)
+    elements = totals.elements(capacity, "PAIRS")
+    return totals, TileLists(Band(0, number), ranges, gaussian_from_sorted, slot_from_sorted, elements, order)

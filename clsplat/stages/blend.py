@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,43 @@ BLEND_PIXEL_BYTES = 20
 """Bytes per pixel of `Blended`, padding included: image, transmittance and stop."""
 
 
-def gradient_pair_bytes(fields: SlotFields) -> int:
-    """Bytes per pair that the gradient of blending needs: the pair's cells and its slot."""
-    return 4 + 4 * fields.floats
+PART_PAIRS = 512
+"""Number of pairs of a list that a group of several items walks in the gradient of blending. A longer list is divided
+between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
+
+
+def gradient_pair_bytes(device: Device, fields: SlotFields) -> int:
+    """Bytes per pair that the gradient of blending needs: the pair's slot, and its cells or its share of a state."""
+    cells, state = 4, 4 * (4 + fields.nearness) * TILE * TILE + 4
+    return 4 * fields.floats + (cells if tile_items(device) == 1 else -(-state // PART_PAIRS))
+
+
+@dataclass(frozen=True, eq=False)
+class ListParts:
+    """Where groups of the gradient of blending begin within long lists (kernels/shared/parts.h).
+
+    states: (boundaries, 4, TILE * TILE), transmittance and colour of a tile's pixels at each boundary; with nearness
+    (boundaries, 5, TILE * TILE).
+    tile_of_state: (boundaries), the tile of the band that owns each state.
+    """
+
+    states: DeviceArray
+    tile_of_state: DeviceArray
+
+    @property
+    def boundaries(self) -> int:
+        """Number of boundaries for which there is room."""
+        return self.states.shape[0]
+
+    @property
+    def arguments(self) -> tuple[Any, Any]:
+        """Kernel arguments. They are buffers, so that a stage's bytes leave them out: few of theirs are used."""
+        return self.states.buffer, self.tile_of_state.buffer
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """The defines of kernels that take `arguments`."""
+        return {"PART_PAIRS": PART_PAIRS, "STATE_SIZE": self.states.shape[1]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +87,7 @@ class Blended:
     stops: (rows, stride) int32, the sorted index of the first pair that is not added to the pixel; -1 in padding.
     cells_from_sorted: (pairs) uint32, the cells in which each pair's Gaussian contributes, as bits; or None.
     nearness: (rows, stride), the sum of weight / depth, if requested.
+    parts: the boundaries within the lists of the last band, or None.
     """
 
     image: DeviceArray
@@ -60,6 +95,7 @@ class Blended:
     stops: DeviceArray
     cells_from_sorted: DeviceArray | None
     nearness: DeviceArray | None = None
+    parts: ListParts | None = None
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
@@ -72,8 +108,6 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
     )
 
 
-_MIN_STRIP_ITEMS = 32
-"""Minimum number of work-items per tile with which kernels/shared/strips.h defines the order of sums over pixels."""
 _MIN_TILE_ITEMS = 8
 """Minimum number of work-items that share a tile: those of one row of a pixel block (kernels/shared/blocks.h). A tile
 that is not shared has one work-item."""
@@ -89,14 +123,6 @@ def tile_items(device: Device) -> int:
 _BUSY_ITEMS = 4096
 """Number of work-items per compute unit above which larger groups in `blend` only add instructions. It is 16 tiles of
 256 work-items or 32 of 128, as predicted for NVIDIA's GPUs (docs/gpu-static.md)."""
-
-
-_GRADIENT_TILES = 12
-"""Number of tiles per compute unit up to which `blend_grad` is quicker in groups of 256 than in groups of 64.
-
-The limit is a prediction for NVIDIA's GPUs. The scene fox, with 11 tiles per unit, takes 0.52 ms instead of 0.62. A
-frame with 13 tiles per unit and shorter lists takes 0.18 ms instead of 0.17. Groups of 128 are slower than 64 in both.
-"""
 
 
 def frame_items(device: Device, tiles: int) -> int:
@@ -127,26 +153,6 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
     return items
 
 
-def gradient_items(device: Device, tiles: int) -> int:
-    """Number of work-items that share a tile in `blend_grad`, in a frame of `tiles` tiles. All numbers of 32 or more
-    give the same bits."""
-    items = tile_items(device)
-    if device.kind != "gpu" or items < _MIN_STRIP_ITEMS or device.shape.by_gaussian:
-        return items
-    return gradient_items_for(tiles, int(device.cl_device.max_compute_units), items, device.max_group)
-
-
-def gradient_items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """Return the number of work-items that share a tile on a GPU, for `gradient_items`.
-
-    tiles: number of tiles of the frame.
-    units: number of the GPU's compute units.
-    items: number of work-items that share a tile by the kernel shape.
-    most: maximum number of work-items in a group.
-    """
-    return TILE * TILE if tiles <= _GRADIENT_TILES * units and most >= TILE * TILE else items
-
-
 _GRADIENT_REGISTERS = {64: 96}
 """Maximum registers per work-item of `blend_grad`, by the number of work-items that share a tile, where the driver
 accepts a limit. Without a limit NVIDIA's assembler uses only 80 registers, so few that loads have to wait for one
@@ -163,18 +169,41 @@ def launch_tiles(
     kernel: str = "",
     items: int | None = None,
     registers: int = 0,
+    more: int = 0,
 ) -> None:
     """Launch a kernel of `stem`.cl, with one group per tile of the lists.
 
     kernel: the kernel's name, if it is not `stem`.
     items: number of work-items that share a tile; None for `tile_items`.
     registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
+    more: number of further groups.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
     items = items or tile_items(device)
     built = getattr(device.kernels(stem, {"ITEMS": items, **defines}, registers), kernel or stem)
-    launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
+    launch_groups(device, built, lists.band.tiles + more, items, lists.band.first, tiles_x, *arguments)
+
+
+def _divides(device: Device) -> bool:
+    """True if groups of the gradient share long lists."""
+    return tile_items(device) > 1 and not _by_gaussian(device)
+
+
+def _by_gaussian(device: Device) -> bool:
+    """True if each item of the gradient's groups owns Gaussians."""
+    return device.shape.by_gaussian and not device.switched("RAYS")
+
+
+def _rays(device: Device, inputs: ImageInputs) -> DeviceArray | None:
+    """The camera, if Gaussians are evaluated along the rays of pixels."""
+    return inputs.camera_array if device.switched("RAYS") else None
+
+
+def _list_parts(work: Workspace, lists: TileLists, *, nearness: bool) -> ListParts:
+    boundaries = lists.gaussian_from_sorted.shape[0] // PART_PAIRS
+    states = work.array("list_states", (boundaries, 5 if nearness else 4, TILE * TILE))
+    return ListParts(states, work.array("tile_of_state", (boundaries,), np.uint32))
 
 
 @stage("blend")
@@ -192,25 +221,35 @@ def blend(
 
     Pixels of other tiles are left unchanged.
 
-    record: also fill `cells_from_sorted`, by which the gradient skips cells, if the kernel shape supports it.
+    record: also fill the arrays of `Blended` that make the gradient quicker, as far as the kernel shape has them.
     nearness: also blend 1 / depth.
     items: number of work-items that share a tile; None for `frame_items`.
     """
-    width, height = inputs.width, inputs.height
-    planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
+    planes, near = _planes(work, inputs.width, inputs.height, kept=lists.band.first > 0), None
     if nearness:
-        near = work.array("nearness", padded_size(width, height), kept=lists.band.first > 0)
-    cells, rays = None, device.switched("RAYS")
-    if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
+        near = work.array("nearness", padded_size(inputs.width, inputs.height), kept=lists.band.first > 0)
+    cells = parts = None
+    if record and not device.switched("RAYS") and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
-    extra = ([near] if near else []) + ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
-    extra += [lists.order] if lists.order else []
+    if record and _divides(device):
+        parts = _list_parts(work, lists, nearness=nearness)
+    blended = Blended(*planes, cells, near, parts)
+    _fill(device, lists, inputs, blended, items or frame_items(device, lists.band.tiles))
+    return blended
+
+
+def _fill(device: Device, lists: TileLists, inputs: ImageInputs, blended: Blended, items: int) -> None:
+    """Fill the arrays of `blended` for the tiles of the lists."""
+    near, cells, parts = blended.nearness, blended.cells_from_sorted, blended.parts
+    planes = (blended.image, blended.transmittance, blended.stops)
+    extra: list[Any] = [array for array in (near, cells) if array]
+    extra += [*(parts.arguments if parts else ()), *(array for array in (_rays(device, inputs), lists.order) if array)]
     arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
     switches = (("NEARNESS", near), ("RECORD_CELLS", cells), ("TILE_ORDER", lists.order))
-    defines = {name: True for name, on in switches if on}
-    items = items or frame_items(device, lists.band.tiles)
-    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays, items=items)
-    return Blended(*planes, cells, near)
+    defines = {**{name: True for name, on in switches if on}, **(parts.defines if parts else {})}
+    launch_tiles(
+        device, "blend", defines, lists, -(-inputs.width // TILE), inputs.width, inputs.height, *arrays, items=items
+    )
 
 
 def count_pairs(
@@ -233,6 +272,18 @@ def count_pairs(
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
     contributing, evaluated = counts.get().sum(axis=0, dtype=np.uint64)
     return int(contributing), int(evaluated)
+
+
+def _divided(
+    device: Device, work: Workspace, lists: TileLists, inputs: ImageInputs, blended: Blended, *, nearness: bool
+) -> Blended:
+    """Blend the tiles of the lists again, for the parts of the lists. They were not kept, or belong to another band."""
+    near = blended.nearness
+    if nearness and near is None:
+        near = work.array("nearness", blended.transmittance.shape)
+    again = replace(blended, nearness=near, parts=_list_parts(work, lists, nearness=near is not None))
+    _fill(device, lists, inputs, again, frame_items(device, lists.band.tiles))
+    return again
 
 
 @stage("blend_grad")
@@ -260,20 +311,35 @@ def blend_grad(
     slots = work.array("slots", (pairs, fields.floats))
     if pairs == 0:
         return slots
-    cells, rays = blended.cells_from_sorted, device.switched("RAYS")
+    if _divides(device) and (blended.parts is None or (fields.nearness and blended.nearness is None)):
+        blended = _divided(device, work, lists, inputs, blended, nearness=fields.nearness)
+    cells, parts = blended.cells_from_sorted, blended.parts
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
-    if device.shape.by_gaussian and not rays:
+    if _by_gaussian(device):
         defines["BY_GAUSSIAN"] = True
     if image_gradient.shape[0] - fields.nearness == 4:
         defines["ALPHA_GRADIENT"] = True
     if lists.order:
         defines["TILE_ORDER"] = True
+    divided: tuple[Any, ...] = ()
+    if parts:
+        defines |= {**parts.defines, **lists.elements.defines}
+        seen = [array.buffer for array in (blended.image, blended.nearness if fields.nearness else None) if array]
+        divided = (parts.boundaries, *lists.elements.arguments, seen[0], *parts.arguments, *seen[1:])
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
-    extra = ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
-    extra += [lists.order] if lists.order else []
-    arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *extra)
-    items = gradient_items(device, lists.band.tiles)
-    most = _GRADIENT_REGISTERS.get(items, 0)
-    launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays, items=items, registers=most)
+    extra = [array for array in (_rays(device, inputs), lists.order) if array]
+    arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *([cells] if cells else []), *divided, *extra)
+    most = _GRADIENT_REGISTERS.get(tile_items(device), 0)
+    launch_tiles(
+        device,
+        "blend_grad",
+        defines,
+        lists,
+        stride // TILE,
+        rows,
+        *arrays,
+        registers=most,
+        more=parts.boundaries if parts else 0,
+    )
     return slots

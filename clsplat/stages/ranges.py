@@ -12,6 +12,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.stages.duplicate import Band, Pairs
+from clsplat.stages.scan import Elements
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
 TILE_SORT_PAIR_BYTES = SORT_KEY_BYTES + 8
@@ -25,6 +26,7 @@ class TileLists:
     """The tile lists of a band.
 
     ranges: (tiles, 2), begin and end of each tile's pairs in gaussian_from_sorted and slot_from_sorted, (pairs) each.
+    elements: the number of pairs in the lists.
     order: (tiles), the tiles in the order in which groups process them; None for the order in the image.
     """
 
@@ -32,6 +34,7 @@ class TileLists:
     ranges: DeviceArray
     gaussian_from_sorted: DeviceArray
     slot_from_sorted: DeviceArray
+    elements: Elements
     order: DeviceArray | None = None
 
 
@@ -51,4 +54,4 @@ def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all
     arrays = (keys, pair_from_sorted, pairs.pair_ids, ranges, slot_from_sorted, gaussian_from_sorted)
     kernel = device.kernels("ranges", elements.defines).ranges
     launch_items(device, kernel, count, *elements.arguments, *arrays)
-    return TileLists(band, ranges, gaussian_from_sorted, slot_from_sorted)
+    return TileLists(band, ranges, gaussian_from_sorted, slot_from_sorted, elements)

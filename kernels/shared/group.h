@@ -66,16 +66,19 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 // tile_order (tiles) lists the tiles in the order in which groups process them.
 #ifdef TILE_ORDER
 #define TILE_ORDER_PARAMETER , __global const uint *tile_order
-#define LISTED_TILE tile_order[get_group_id(0)]
+#define LISTED_TILE(group) tile_order[group]
 #else
 #define TILE_ORDER_PARAMETER
-#define LISTED_TILE get_group_id(0)
+#define LISTED_TILE(group) (group)
 #endif
 
 // Defines the group's tile, from the kernel's arguments first_tile, tiles_x, height and ranges: (tile_x, tile_y), the
 // tile's first pixel; [begin, end), the tile's pairs; stride and plane, the distances of rows and of planes in floats.
 #define TILE_OF_GROUP                                                                                                  \
-  const int listed_tile = LISTED_TILE, tile = first_tile + listed_tile;                                                \
+  const int listed_tile = LISTED_TILE(get_group_id(0));                                                                \
+  TILE_OF_LIST(begin, end)
+#define TILE_OF_LIST(begin, end)                                                                                       \
+  const int tile = first_tile + listed_tile;                                                                           \
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
   const int begin = ranges[2 * listed_tile], end = ranges[2 * listed_tile + 1];                                        \
   const size_t stride = (size_t)tiles_x * TILE;                                                                        \

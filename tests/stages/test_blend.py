@@ -27,7 +27,7 @@ from clsplat.models.edit import take
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.blend import frame_items, gradient_items
+from clsplat.stages.blend import frame_items
 from clsplat.stages.device_gaussians import upload_gaussians
 
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
@@ -120,37 +120,6 @@ def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeyp
     assert groups == [256], "20 tiles for the units of a CPU"
     for plane, wanted in zip((wide.image, wide.transmittance, wide.stops), alone, strict=True):
         assert_same_bits(plane.get(), wanted)
-
-
-@pytest.mark.parametrize(("kind", "group", "tiles", "shape", "items"), [
-    ("gpu", 1024, 1584, Shape(lanes=1, items=64, chunks=8), 256),
-    ("gpu", 1024, 1585, Shape(lanes=1, items=64, chunks=8), 64),
-    ("gpu", 1024, 1584, Shape(lanes=1, items=32, chunks=8), 256),
-    ("gpu", 1024, 1584, Shape(lanes=1, items=16, chunks=8), 16),
-    ("gpu", 1024, 1584, Shape(lanes=1, items=64, chunks=8, by_gaussian=True), 64),
-    ("gpu", 1024, 1584, Shape(lanes=8, items=1, chunks=8), 1),
-    ("gpu", 128, 1584, Shape(lanes=1, items=64, chunks=8), 64),
-    ("cpu", 1024, 1584, Shape(lanes=1, items=64, chunks=8), 64),
-])  # fmt: skip
-def test_the_gradient_of_few_tiles_is_shared_by_256_items(
-    kind: str, group: int, tiles: int, shape: Shape, items: int
-) -> None:
-    limits = SimpleNamespace(max_compute_units=132)
-    device = SimpleNamespace(kind=kind, max_group=group, cl_device=limits, shape=shape)
-    assert gradient_items(cast("Device", device), tiles) == items
-
-
-def test_a_gpu_takes_the_gradient_of_few_tiles_in_the_largest_group(
-    default_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    device, scene = shaped(default_device, 1, 64), HARD["cloud"]()
-    run = Pipeline.run(device, scene)
-    alone = run.slots(noise(run))
-    groups = launched_as_on_a_gpu(device, monkeypatch)
-    wide = Pipeline.run(device, scene)
-    groups.clear()
-    assert_same_bits(wide.slots(noise(wide)), alone)
-    assert groups == [256], "20 tiles for the units of a CPU"
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.selftest.case import Case, Inputs, faults
 from clsplat.selftest.cases.table import CASES
 from clsplat.stages import append as stages_append
+from clsplat.stages import blend as stages_blend
 from clsplat.stages import scan as stages_scan
 from clsplat.stages.adam import add_view
 from clsplat.stages.appearance import Gains, step_gains
@@ -127,6 +128,26 @@ def subgroups(device: Device) -> None:
         slots = rasterizer.pair_gradients(frame, image_gradient(each, frame), fields=WIDEST_SLOTS)
         if not np.isfinite(slots.values.get()).all():
             raise SystemExit("a sum by sub-groups or rows is not finite")
+
+
+def long_lists(device: Device) -> None:
+    """A list of several parts, which groups share in the gradient of blending, by as few pairs as the shape allows: a
+    part has a batch of the shape's own groups."""
+    if device.shape.items == 1:
+        return
+    own, usual = device.with_shape(device.shape.label), stages_blend.PART_PAIRS
+    own.max_group = own.shape.items
+    stages_blend.PART_PAIRS = part = max(own.shape.items, 64)
+    view = camera(9, 7)
+    gaussians = cloud(4 * part, view, 2, degree=0)
+    gaussians.opacity_logits[:] = np.linspace(-5, -2, len(gaussians), dtype=np.float32)  # so that no pixel is full soon
+    rasterizer, held = Rasterizer(own), upload_gaussians(own, gaussians)
+    frame = rasterizer.forward(held, view, np.zeros(3, np.float32), nearness=True)
+    planes = np.random.default_rng(1).normal(size=(5, *frame.blended.stops.shape)).astype(np.float32)
+    slots = rasterizer.pair_gradients(frame, upload(own, planes), fields=WIDEST_SLOTS).values.get()
+    if not 2 * part < len(slots) or not np.isfinite(slots).all() or not slots[:, 0].any():
+        raise SystemExit(f"the slots of a long list: {slots.shape}, expected finite ones of over {2 * part} pairs")
+    stages_blend.PART_PAIRS = usual
 
 
 def cases(device: Device) -> None:
@@ -386,7 +407,7 @@ PARTS = {
     "more": (more_training,),
     "library": (library,),
     "cases": (cases, sorts, lists),
-    "passes": (limits, frames, subgroups, rendering, pictures, density),
+    "passes": (limits, frames, subgroups, long_lists, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""
 WHOLE_ONLY = ("more",)

@@ -219,8 +219,9 @@ def _work_of(
     if name in BY_PAIR:
         waves = max(waves, size / source.items)
         pairs = frame["walked"] * run.waves / waves
-        slow = costs(source, name, replace(run, listed=frame["slowest"], **longest_of(frame, source.items)))
-        longest = slow.first + slow.then.times(frame["slowest"])
+        walked = min(frame["slowest"], _part_of(launch))
+        slow = costs(source, name, replace(run, listed=walked, **longest_of(frame, source.items)))
+        longest = slow.first + slow.then.times(walked)
     if name == SORTING:
         slow = costs(source, name, replace(run, sorting=sorting_of([(1, frame["longest_listed"])], source.items)))
         longest = slow.first + slow.then
@@ -236,6 +237,12 @@ def _work_of(
         name,
         **({"atomics": frame["listed"], "counters": run.lists} if name in APPENDING else {}),
     )
+
+
+def _part_of(launch: Mapping[str, Any]) -> float:
+    """Maximum number of a list's pairs that a group walks: those of a part, in a gradient that divides lists."""
+    parts = [each.partition("=")[2] for each in launch["options"] if each.startswith("-DPART_PAIRS=")]
+    return int(parts[0]) if parts and launch["kernel"] == "blend_grad" else math.inf
 
 
 def stages_of(works: Iterable[Work | None], gpu: Gpu, constants: Constants) -> dict[str, Stage]:

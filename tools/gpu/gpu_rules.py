@@ -16,6 +16,7 @@ from gpu_run import BATCH_BACK, BLOCKS, PER_ITEM, Run
 
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
+from clsplat.stages.blend import PART_PAIRS
 
 if TYPE_CHECKING:
     from gpu_assembly import Loop
@@ -118,6 +119,12 @@ _TURNS, _JOINS = "for (int turn = first; turn < stop_at;", "for (int turn = firs
 
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend": (
+        Rule(  # once a tile
+            "for (int state = FIRST_STATE(begin) + ITEM; state < FIRST_STATE(end); state += ITEMS)",
+            lambda run: 0,
+            ends=("tile_of_state[state] = listed_tile;",),
+        ),
+        Rule("const int state = FIRST_STATE(begin) + (batch - begin)", lambda run: run.batch / PART_PAIRS, part=True),
         Rule("for (int batch = begin", lambda run: run.batches, ends=("if (live == 0) break;",)),
         Rule("for (int k = 1; k <= count; ++k)", lambda run: run.visits, mark=("shared", 4)),
         _of_visit("for (int k = 1; k <= count; ++k)", lambda run: run.visits),

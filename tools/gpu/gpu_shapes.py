@@ -12,13 +12,13 @@ from gpu_model import tiles_of
 from gpu_page import SHAPE, trained_and_picture
 
 from clsplat.layouts.columns import TILE
-from clsplat.stages.blend import gradient_items_for, items_for
+from clsplat.stages.blend import items_for
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
 FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
 """Shapes that differ only in the form of blending's gradient."""
-BY_FRAME = {"blend": items_for, "sort_lists": items_for, "blend_grad": gradient_items_for}
-"""Kernels whose groups follow the frame, and how (`clsplat.stages.blend.frame_items` and `gradient_items`)."""
+BY_FRAME = {"blend": items_for, "sort_lists": items_for}
+"""Kernels whose groups follow the frame, and how (`clsplat.stages.blend.frame_items`)."""
 
 
 def on_each_gpu(works: Mapping[str, Works], frames: Sequence[Mapping[str, Any]]) -> Works:
