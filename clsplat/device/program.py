@@ -132,7 +132,7 @@ class Kernel:
         self.tried: set[str] = set()
 
     def most_items(self, device: cl.Device) -> int:
-        """Maximum work-items in a group of this kernel: the driver's number, or the kernel's `reqd_work_group_size`.
+        """Maximum work-items in a group of this kernel: what the driver reports, or its `reqd_work_group_size`.
 
         The larger of the two counts, as NVIDIA's driver reports 256 also for kernels that it has built for 1024.
         """

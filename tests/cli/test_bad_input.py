@@ -172,7 +172,7 @@ def no_opacity(head: bytes, data: bytes) -> tuple[bytes, str]:
 def all_nan(head: bytes, data: bytes) -> tuple[bytes, str]:
     return head + np.full(
         len(data) // 4, np.nan, "<f4"
-    ).tobytes(), "the first is a position of Gaussian 0; expected some"
+    ).tobytes(), "the first is a position of Gaussian 0; expected at least one with finite values"
 
 
 def no_gaussians(head: bytes, data: bytes) -> tuple[bytes, str]:
