@@ -274,8 +274,8 @@ def test_a_dense_pair_and_the_blocks_of_others() -> None:
 def test_the_work_of_a_launch(
     monkeypatch: pytest.MonkeyPatch, kernel: str, options: tuple[str, ...], walked: int
 ) -> None:
-    """Ten groups of 64 items: five instructions, and eight a pair, of which half are skipped. Of the slowest tile's nine
-    pairs no group of the gradient walks more than a part."""
+    """Ten groups of 64 items: five instructions, and eight a pair, of which half are skipped. Of the slowest tile's
+    nine pairs no group of the gradient walks more than a part."""
     loop = Loop([code(("FADD", control(2)), source=2), code(*[("FMUL", control(4))] * 7, source=3)], {2})
     whole = Loop([code(*[("FADD", control(1))] * 5)], set(), [loop])
     source = Source("blend", options)
