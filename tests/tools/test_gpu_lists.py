@@ -154,7 +154,7 @@ def test_frames_of_few_tiles_have_larger_groups() -> None:
     }
     found = on_each_gpu(works, frames)
     assert {gpu for gpu, _ in found} == {"H100 SXM", "H200"}
-    assert [work and work.bytes for work in found["H200", "small"]] == [None, 256, 256, 256, 64]
+    assert [work and work.bytes for work in found["H200", "small"]] == [None, 256, 256, 64, 64]
     assert [work and work.bytes for work in found["H200", "middling"]] == [None, 128, 128, 64, 64]
     assert found["H200", "small" + DRAWN] == found["H200", "small"]
     assert found["H200", "large"] == works["1x64"]["sm_90", "large"]

@@ -265,13 +265,22 @@ def test_a_dense_pair_and_the_blocks_of_others() -> None:
     assert cost.rounds.total() == pytest.approx(counted)
 
 
-def test_the_work_of_a_launch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten groups of 64 items: five instructions, and eight a pair, of which half are skipped."""
+@pytest.mark.parametrize(("kernel", "options", "walked"), [
+    ("blend", ("-DITEMS=64",), 9),
+    ("blend", ("-DITEMS=64", "-DPART_PAIRS=4"), 9),
+    ("blend_grad", ("-DITEMS=64",), 9),
+    ("blend_grad", ("-DITEMS=64", "-DPART_PAIRS=4"), 4),
+])  # fmt: skip
+def test_the_work_of_a_launch(
+    monkeypatch: pytest.MonkeyPatch, kernel: str, options: tuple[str, ...], walked: int
+) -> None:
+    """Ten groups of 64 items: five instructions, and eight a pair, of which half are skipped. Of the slowest tile's
+    nine pairs no group of the gradient walks more than a part."""
     loop = Loop([code(("FADD", control(2)), source=2), code(*[("FMUL", control(4))] * 7, source=3)], {2})
     whole = Loop([code(*[("FADD", control(1))] * 5)], set(), [loop])
-    source = Source("blend", ("-DITEMS=64",))
+    source = Source("blend", options)
     rules = (Rule("walk", lambda run: 1), Rule("weight", lambda run: run.taken / BLOCKS, part=True))
-    monkeypatch.setitem(BY_PAIR, "blend", rules)
+    monkeypatch.setitem(BY_PAIR, kernel, rules)
     monkeypatch.setattr(Source, "lines", ["kernel", "walk", "weight"])
     frame = {"width": 160, "height": 16, "gaussians": 25, "visible": 20, "listed": 40, "walked": 30, "sh_degree": 3}
     frame |= {
@@ -283,9 +292,9 @@ def test_the_work_of_a_launch(monkeypatch: pytest.MonkeyPatch) -> None:
         **WALKS,
         **asdict(Boxes()),
     }
-    launch = {"kernel": "blend", "stem": "blend", "options": list(source.options), "stage": "blend", "shared": 0}
+    launch = {"kernel": kernel, "stem": "blend", "options": list(source.options), "stage": "blend", "shared": 0}
     launch |= {"size": [640], "local": [64], "scalars": [], "bytes": 5e6}
-    built = {(source, "blend"): Built("blend", "sm_90", 64, 0, 0, 0, whole)}
+    built = {(source, kernel): Built(kernel, "sm_90", 64, 0, 0, 0, whole)}
     (work, read_back, filled) = works_of(
         [launch, {"kernel": "read", "stage": "x"}, {"kernel": "fill", "stage": "x", "bytes": 7}], built, frame
     )
@@ -293,9 +302,9 @@ def test_the_work_of_a_launch(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (work.groups, work.waves, work.resident) == (10, 20, 32)
     assert work.instructions == 20 * 5 + 30 * 2 * (1 + 7 / 2)
     assert work.chain == Chain(5 + 3 * (2 + 28 / 2))  # three pairs a tile
-    assert work.longest == Chain(5 + 9 * (2 + 28 * 3 / 4))
+    assert work.longest == Chain(5 + walked * (2 + 28 * 3 / 4))
     assert read_back is None
-    assert (work.kernel, filled) == ("blend", Work("x", 7, kernel="fill"))
+    assert (work.kernel, filled) == (kernel, Work("x", 7, kernel="fill"))
     assert set(stages_of([work, read_back, filled], GPU, CONSTANTS)) == {"blend", "x"}
 
 
