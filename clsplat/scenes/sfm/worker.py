@@ -26,7 +26,14 @@ from typing import Any, TextIO
 import pycolmap
 
 MAX_SINGLE_THREAD_PHOTOS = 80
-"""Number of photographs up to which mapping runs on one thread, so that its result is reproducible, at little cost."""
+"""Number of photographs up to which matching and mapping run on one thread each, so that their results are
+reproducible.
+
+Mapping on several threads adds in varying order. Matching on several threads multiplies matrices in each of them, by
+the OpenBLAS of pycolmap 4.2, which is built without threads and without locks: two threads may take the same scratch
+memory, and then find wrong neighbours for the features of a photograph, once in some 70 reconstructions on a busy
+machine. Verification of the matches has a thread of its own.
+"""
 MIN_OPENCV_PHOTOS = 20
 """Minimum number of photographs of one camera for fitting the eight parameters of OPENCV.
 
@@ -50,6 +57,12 @@ class Worker:
         self.photos, self.work = Path(task["photos"]), Path(task["work"])
         self.database = self.work / "database.db"
         self.count = sum(map(len, task["groups"]))
+
+    @property
+    def reproducible_threads(self) -> int:
+        """Number of threads of the stages whose results depend on it; see MAX_SINGLE_THREAD_PHOTOS."""
+        threads: int = self.task["threads"]
+        return 1 if self.count <= MAX_SINGLE_THREAD_PHOTOS else threads
 
     def say(self, **message: Any) -> None:
         print(json.dumps(message), file=self.channel, flush=True)
@@ -114,7 +127,7 @@ class Worker:
         """Match features of all pairs, or of neighbours in the order of names, and verify them by epipolar geometry."""
         options = pycolmap.FeatureMatchingOptions()
         options.use_gpu = False
-        options.num_threads = self.task["threads"]
+        options.num_threads = self.reproducible_threads
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = self.task["seed"]
         if self.task["sequential"]:
@@ -139,7 +152,7 @@ class Worker:
         """
         self.say(stage="cameras again" if relaxed else "cameras", total=self.count)
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = 1 if self.count <= MAX_SINGLE_THREAD_PHOTOS else self.task["threads"]
+        options.num_threads = self.reproducible_threads
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.task["seed"]
         options.min_model_size = 3
         if relaxed:
