@@ -41,10 +41,18 @@ def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, 
     return down, along, _hats(level, levels), (levels - 1) * inside * slope
 
 
+def _maps(down: Float64, along: Float64, levels: Float64, grid: Float64) -> Float64:
+    """Interpolate a grid to the pixels: (H, W, 3, 4). One axis after the other, as NumPy finds no such order itself."""
+    rows = np.tensordot(down, grid, axes=(1, 1))  # (H, levels, columns, 3, 4)
+    pixels = np.tensordot(rows, along, axes=(2, 1))  # (H, levels, 3, 4, W)
+    maps: Float64 = np.einsum("yxl,ylabx->yxab", levels, pixels)
+    return maps
+
+
 def apply(image: Float64, grid: Float64) -> Float64:
     """Transform the colours of an image (H, W, 3) by a grid."""
     down, along, levels, _ = _weights(image, grid.shape[:3])
-    maps = np.einsum("yj,xi,yxl,ljiab->yxab", down, along, levels, grid, optimize=True)
+    maps = _maps(down, along, levels, grid)
     seen: Float64 = np.einsum("yxab,yxb->yxa", maps[..., :3], image) + maps[..., 3]
     return seen
 
@@ -56,10 +64,10 @@ def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, 
     """
     down, along, levels, slopes = _weights(image, grid.shape[:3])
     whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
-    by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)
-    maps, risen = (
-        np.einsum("yj,xi,yxl,ljiab->yxab", down, along, each, grid, optimize=True) for each in (levels, slopes)
-    )
+    by_levels = np.einsum("yxl,yxa,yxb->yxlab", levels, by_seen, whole)
+    by_columns = np.tensordot(by_levels, along, axes=(1, 0))  # (H, levels, 3, 4, columns)
+    by_grid: Float64 = np.tensordot(down, by_columns, axes=(0, 0)).transpose(1, 0, 4, 2, 3)
+    maps, risen = (_maps(down, along, each, grid) for each in (levels, slopes))
     by_luminance = np.einsum("yxa,yxab,yxb->yx", by_seen, risen, whole)
     by_image = np.einsum("yxa,yxab->yxb", by_seen, maps[..., :3]) + by_luminance[..., None] * LUMINANCE_WEIGHTS
     return by_image, by_grid

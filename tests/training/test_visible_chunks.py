@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from calls import noted
 from compare import assert_same_bits
+from pipeline import shaped
 from quick import quick
 from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, run_steps, short
@@ -116,6 +117,20 @@ SETTINGS = {
 }
 
 
+@pytest.fixture(scope="module")
+def of_whole() -> dict[tuple[str, Device], State]:
+    """States of trainings over the whole model, by settings and device: one for all tests that compare with it."""
+    return {}
+
+
+def whole_state(of_whole: dict[tuple[str, Device], State], scene: Scene, name: str, device: Device) -> State:
+    """The state after 32 steps over the whole model. It is trained at the first call."""
+    key = (name, device)
+    if key not in of_whole:
+        of_whole[key], _ = trained(scene, SETTINGS[name], device, 32, whole=True)
+    return of_whole[key]
+
+
 @pytest.mark.parametrize("lanes", quick([8, 1], 8))
 @pytest.mark.parametrize("capacity", quick("01", "0"))
 @pytest.mark.parametrize("name", quick(SETTINGS, "dense", "sparse"))
@@ -127,10 +142,11 @@ def test_the_bytes_of_the_whole_model(
     name: str,
     capacity: str,
     lanes: int,
+    of_whole: dict[tuple[str, Device], State],
 ) -> None:
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, capacity)
-    config, device = SETTINGS[name], device if lanes > 1 else device.with_shape(lanes=1, items=64)
-    wanted, _ = trained(scene, config, device, 32, whole=True)
+    config, device = SETTINGS[name], device if lanes > 1 else shaped(device, 1, 64)
+    wanted = whole_state(of_whole, scene, name, device)
     assert not shares
     got, trainer = trained(scene, config, device, 32)
     assert_same(got, wanted)
@@ -152,10 +168,11 @@ in view. A host limit puts the chunks into a file."""
 @pytest.mark.parametrize("optimiser", ["dense", "sparse"])
 @pytest.mark.parametrize("name", LIMITS)
 def test_a_streamed_model(
-    scene: Scene, default_device: Device, shares: list[float], tmp_path: Path, optimiser: str, name: str
-) -> None:
+    scene: Scene, default_device: Device, shares: list[float], tmp_path: Path, optimiser: str, name: str,
+    of_whole: dict[tuple[str, Device], State],
+) -> None:  # fmt: skip
     """At every limit the model has the bytes of one that is on the device."""
-    wanted, _ = trained(scene, SETTINGS[optimiser], default_device, 32, whole=True)
+    wanted = whole_state(of_whole, scene, optimiser, default_device)
     of_device, of_host = LIMITS[name]
     device = default_device if of_device is None else open_device(memory_limit=of_device)
     memory = HostMemory(limit=of_host, scratch=tmp_path, owner="test")
@@ -227,11 +244,12 @@ def test_a_look_at_a_streamed_model(
 @pytest.mark.parametrize("optimiser", ["dense", "sparse"])
 @pytest.mark.parametrize("steps", [(7,), (12, 13), (15, 25), (32,)])
 def test_steps_that_are_repeated(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, optimiser: str, steps: Collection[int]
-) -> None:
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, optimiser: str, steps: Collection[int],
+    of_whole: dict[tuple[str, Device], State],
+) -> None:  # fmt: skip
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     config = SETTINGS[optimiser]
-    wanted, _ = trained(scene, config, default_device, 32, whole=True)
+    wanted = whole_state(of_whole, scene, optimiser, default_device)
     got, trainer = trained(scene, config, default_device, 32, change=lambda t: make_too_small(monkeypatch, t, steps))
     assert trainer.pending.redone > 0
     assert_same(got, wanted)
@@ -255,8 +273,10 @@ def test_a_model_that_grows_into_chunks(
     assert 0 < len(shares) <= 17, "from density control after step 15 on"
 
 
-def test_chunks_are_caught_up_in_time(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    wanted, _ = trained(scene, SETTINGS["dense"], default_device, 32, whole=True)
+def test_chunks_are_caught_up_in_time(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, of_whole: dict[tuple[str, Device], State]
+) -> None:
+    wanted = whole_state(of_whole, scene, "dense", default_device)
     for most, measured in ((5, 1), (3, 7), (1, 16)):
         monkeypatch.setattr(visible_chunks, "MOST_MISSED_STEPS", most)
         monkeypatch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", measured)
@@ -273,8 +293,10 @@ def note(calls: list[tuple[Any, ...]], *arguments: Any) -> None:
     calls.append(arguments)
 
 
-def test_a_look_changes_no_byte(scene: Scene, default_device: Device) -> None:
-    wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+def test_a_look_changes_no_byte(
+    scene: Scene, default_device: Device, of_whole: dict[tuple[str, Device], State]
+) -> None:
+    wanted = whole_state(of_whole, scene, "dense", default_device)
     trainer = Trainer(scene, CONFIG, default_device, wide_model())
     for step in range(32):
         trainer.train_step()
@@ -301,9 +323,9 @@ def test_interrupted_and_resumed(scene: Scene, default_device: Device, tmp_path:
 
 
 def test_a_step_that_fails_leaves_the_state_before_it(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, of_whole: dict[tuple[str, Device], State]
 ) -> None:
-    wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+    wanted = whole_state(of_whole, scene, "dense", default_device)
     trainer = Trainer(scene, CONFIG, default_device, wide_model())
     run_steps(22, trainer)
     with monkeypatch.context() as patch:
