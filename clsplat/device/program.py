@@ -74,10 +74,11 @@ def text_of(stem: str) -> str:
 
 
 def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
-    """Compile a kernel file. Returns the program, and the salt (`Variant.anew`) that its build needed, usually empty.
+    """Compile a kernel file. Returns the program, and the salt that its build needed: a random text added to the source
+    (`Variant.anew`), usually empty.
 
-    A failed build is repeated once, with a text that is unique to this process. PoCL's cache has two faults: it may
-    hold a program without kernels from an aborted build, and another process may remove files of a build under way.
+    A failed build is repeated once, with a salt. PoCL's cache has two faults: it may hold a program without kernels
+    from an aborted build, and another process may remove files of a build under way.
 
     Raises KernelBuildError with the device, options, log and source; and DriverError for a program without kernels.
     """

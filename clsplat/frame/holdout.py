@@ -11,9 +11,10 @@ from clsplat.images.holdouts import Holdout, Surfaces
 
 
 class Cut:
-    """Function that returns the surfaces of a frame's holdout in a camera's picture.
+    """Function that returns a frame's holdout surfaces at the pixels of a camera's picture.
 
-    The last result is cached, because it is the same for all samples of shutter and lens.
+    Only the picture's size and window matter, not the pose, so the last result is cached and reused for all samples of
+    shutter and lens.
     """
 
     def __init__(self, holdout: Holdout) -> None:

@@ -374,9 +374,11 @@ class GivenShapes:
     def checked(
         cls, count: int, covars: ArrayLike | None, quaternions: ArrayLike | None, scales: ArrayLike | None
     ) -> GivenShapes:
-        """Check the shapes of Gaussians that a caller gave. Raises InputError, which names the argument.
+        """Check a caller's covariances, or quaternions and scales, and return them as float32 arrays.
 
-        count: number of Gaussians. covars: None if quaternions and scales are given.
+        count: number of Gaussians, which the arrays must have.
+        covars: None if quaternions and scales are given.
+        Raises InputError, which names the argument.
         """
         check_given(covars, quaternions, scales)
         if quaternions is not None and scales is not None:

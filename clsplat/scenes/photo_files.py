@@ -14,9 +14,10 @@ from clsplat.images.reading import companions, find_images
 from clsplat.scenes.photo_names import legible, match, nearest, slashed
 
 DOWNSCALED_FOLDER_FACTORS = (2, 4, 8)
-"""Factors of the folders of downscaled pictures (images_2 and so on) that are used if their size is requested."""
+"""Factors by which the sides of downscaled pictures are divided, such as 2 in the folder images_2. Folders with these
+factors are used if pictures of exactly their size are requested."""
 FALLBACK_FOLDER_FACTORS = range(2, 65)
-"""Factors of the folders of downscaled pictures that are used if there are no other pictures."""
+"""Factors, likewise, of folders that are recognised as downscaled copies, and used if there are no other pictures."""
 MAX_MISSING_FRACTION = 0.1
 """Maximum fraction of missing pictures by default, as users delete some or do not copy all.
 

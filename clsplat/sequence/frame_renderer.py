@@ -73,7 +73,7 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class DevicePlan:
-    """Memory plan of a device for the frame of a job that needs most memory.
+    """Memory plan of a device, for the job's frame that needs the most memory.
 
     device: name of the device.
     strips: number of strips in which the frame is rendered.

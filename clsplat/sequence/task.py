@@ -177,7 +177,8 @@ class Task:
     def seen_by(self, gaussians: Gaussians, nears: Mapping[float, float]) -> Task:
         """Return the task with cameras that have the model's near plane, and project along rays if the model needs it.
 
-        nears: near planes by time in frames relative to this frame.
+        nears: the models' near plane at each time of the shutter (`model_times`); keys are times in frames, 0 for this
+            frame's own. Not used if the camera has a near plane of its own.
         """
 
         def seen(camera: Camera) -> Camera:

@@ -135,7 +135,8 @@ def whole_frames(where: str, what: str, begin: float, end: float) -> list[int]:
     where: file or prim, to begin the error's message. what: name of the numbers in the message, such as "frame".
     """
     if not (isfinite(end - begin) and end - begin < MAX_SHOT_FRAMES):
-        raise InputError(f"{where}: has the {what}s {begin:g} to {end:g}, expected at most {MAX_SHOT_FRAMES:,}")
+        found = f"has the {what}s {begin:,.15g} to {end:,.15g}"  # 15 digits: large numbers are written in full
+        raise InputError(f"{where}: {found}, expected at most {MAX_SHOT_FRAMES:,} {what}s")
     frames = list(range(ceil(begin), floor(end) + 1))
     if not frames:
         raise InputError(f"{where}: has no whole {what} from {begin:g} to {end:g}, expected at least one")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks and refusals of arguments (InputError), and conversions between tensors and arrays.
 
-Arguments of `rasterization` such as tile_size and camera_model, and which of them are refused: `torch/rendering.py`.
+Arguments of `rasterization` such as tile_size and camera_model: `torch/rendering.py`. The names of those that are
+refused stand at the calls of `_refuse_missing` and `_refuse_settings` there.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """gsplat's `rasterization`: images of Gaussians, with their gradient. Arguments of gsplat that clsplat does not support
-raise InputError."""
+raise InputError; their names stand at the calls of `_refuse_missing` and `_refuse_settings` in `rasterization`."""
 
 from __future__ import annotations
 

@@ -193,7 +193,7 @@ class TrainingSession:
         if self.run is not None:
             self.run.truncate_metrics(trainer.step)
             self.saved = -1
-            self.save()  # the smaller learning rates must survive a crash
+            self.save()  # a crash must not lose the smaller `rate_factor` of `retries`
         warnings.warn(
             f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had "
             "values that were not finite: "

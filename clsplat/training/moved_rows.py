@@ -114,7 +114,8 @@ def halve(
 ) -> None:
     """Replace the two copies of each split Gaussian in `parameters` with its halves.
 
-    moved: the rows of the model, among them the copies.
+    parameters: the model after its rows have moved, in which each split Gaussian stands twice. Changed in place.
+    moved: the rows of this model; its `halves_at` gives the rows of the two copies.
     halves: function that computes the first halves, or with True as second argument the second halves (`RowPlan`).
     halved: parameter groups that `halves` reads.
     at_once: number of split Gaussians whose halves are computed at a time; 0 computes all, so that one copy of each

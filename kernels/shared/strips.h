@@ -98,8 +98,9 @@ static inline void leave_pixel(Share share, float u, float v, __local float *blo
 }
 
 // Adds up a pair's gradients in the lane's pixel of each block, from the values that LEAVE_PIXEL has stored, and stores
-// the sums in the pair's first rows. blocks: the set of blocks that the pair reaches; strip: the image's gradient in
-// the lane's pixel of each block.
+// the sums in local memory in the first SLOT_STRIDE rows of the pair (PAIR_ROWS), one for each field, over the values
+// that LEAVE_PIXEL stored there. blocks: the set of blocks that the pair reaches; strip: the image's gradient in the
+// lane's pixel of each block.
 static inline void join_blocks(uint blocks, const Pixels *strip, float v, float l11, float l12, float l22,
                                __local float *pair_rows) {
   float sums[SLOT_STRIDE];

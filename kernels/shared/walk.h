@@ -45,9 +45,10 @@ typedef struct {
 #define NEAR_PIXELS_PARAMETER
 #endif
 
-// Undoes the blending of *w's pair in the pixels of a chunk, and adds the pixels' gradients to the pair's sums
-// (SLOT_STRIDE). Pixels to which the pair was not added are processed with alpha 0, without a branch. Of 32 items, one
-// nearly always has a pixel to which its pair was added, so branches would only serialise the pixels of a chunk.
+// Undoes the blending of *w's pair in a chunk of pixels (CHUNK pixels of one row of the tile), and adds their gradients
+// to `sums`, the pair's SLOT_STRIDE sums. Pixels to which the pair was not added are processed with alpha 0, without a
+// branch. Of 32 items, one nearly always has a pixel to which its pair was added, so branches would only serialise the
+// pixels of a chunk.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
                               float *sums NEAR_PIXELS_PARAMETER) {
   const float dy = w->my - (float)(chunk / ROW_CHUNKS), v = w->l22 * dy;

@@ -404,7 +404,9 @@ def test_values_that_are_activated_already(model: Path, which: str, capsys: Capt
     target = model.with_name("right.ply")
     for verb in (["info", str(model)], ["convert", str(model), str(target.with_name("wrong.ply"))]):
         lines = [line for line in printed(capsys, verb).err.splitlines() if f"--activated {which}`" in line]
-        warned = [name for name in ("opacities", "scales") if any(f": all {name} lie in 0.0" in line for line in lines)]
+        warned = [
+            name for name in ("opacities", "scales") if any(f": all {name} are between 0.0" in line for line in lines)
+        ]
         assert warned == (["opacities", "scales"] if which == "both" else [which])
     assert "warning" not in ran(capsys, convert, model, target, "--activated", which).err
     found = difference.errors(wanted, Gaussians.load(target))

@@ -53,8 +53,8 @@ def test_opacities_of_trained_models_are_doubted(highest: float, least: float) -
     opacity = np.r_[values.opacities(trained(highest)), highest].astype(np.float32)
     opacity = opacity[opacity >= least]
     (text,) = repair.encoding_warnings(opacity, np.resize(LOGS, (len(opacity), 3)))
-    assert text.startswith("all opacities lie in ")
-    assert "as opacities from 0 to 1 do" in text
+    assert text.startswith("all opacities are between ")
+    assert "as opacities from 0 to 1 are" in text
 
 
 @pytest.mark.parametrize("white", [100, 255, 65535])
@@ -65,7 +65,7 @@ def test_levels_of_any_white(tmp_path: Path, white: int, dark: bool) -> None:
     levels = np.rint(RNG.uniform(0, (0.66 if dark else 1) * white, 400))
     model.opacity_logits = levels.astype(np.float32)
     model.save(path)
-    assert ("as percentages do" if white == 100 else "as levels do") in only(warnings_of(lambda: formats.load(path)))
+    assert ("as percentages are" if white == 100 else "as levels are") in only(warnings_of(lambda: formats.load(path)))
     right = formats.load(path, activated="opacities")
     np.testing.assert_allclose(values.opacities(right.opacity_logits), levels / white, atol=1e-6)  # float32's
 
@@ -86,7 +86,7 @@ def test_convert_tells_of_its_source_once(tmp_path: Path, ending: str, capsys: C
     model.opacity_logits = RNG.uniform(0, 1, 400).astype(np.float32)
     model.save(tmp_path / "model.ply")
     said = printed(capsys, ["convert", tmp_path / "model.ply", tmp_path / f"other{ending}"]).err
-    assert said.count("as opacities from 0 to 1 do") == 1
+    assert said.count("as opacities from 0 to 1 are") == 1
     model.opacity_logits = np.concatenate([trained(0.69), trained(0.69)])[:400]
     model.save(tmp_path / "model.ply")
     pruned = str(tmp_path / f"pruned{ending}")

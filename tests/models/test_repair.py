@@ -48,7 +48,7 @@ def told(path: Path) -> tuple[Gaussians, list[str]]:
 def right(path: Path, meant: str) -> Gaussians:
     """The model as it is meant, without a warning; `meant` is what it is told that all of them are."""
     _, (text,) = told(path)
-    assert text.startswith(f"all {meant} lie in ")
+    assert text.startswith(f"all {meant} are between ")
     assert text.endswith(f"`clsplat convert --activated {meant}` writes a correct model")
     with no_warnings():
         return formats.load(path, activated=meant)

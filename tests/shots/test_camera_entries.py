@@ -70,4 +70,4 @@ def test_whole_frames() -> None:
     assert whole_frames("a", "frame", 1.5, 4.0) == [2, 3, 4]
     refuses(r"^a: has no whole frame from 1\.2 to 1\.8, expected at least one$", whole_frames, "a", "frame", 1.2, 1.8)
     for begin, end in ((0.0, 1e5), (0.0, float("inf")), (float("inf"), 0.0), (float("nan"), 1.0)):
-        refuses(r"^a: has the frames .* expected at most 100,000$", whole_frames, "a", "frame", begin, end)
+        refuses(r"^a: has the frames .* expected at most 100,000 frames$", whole_frames, "a", "frame", begin, end)

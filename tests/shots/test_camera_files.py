@@ -243,7 +243,7 @@ def test_lenses_of_own_format(tmp_path: Path) -> None:
         ({"keys": [key(frame="1")]}, "key 0: 'frame' is '1', expected a number"),
         ({"keys": [key(), key(), key(frame=3)]}, "has two keys at frame 1, expected one"),
         ({"keys": [key(frame=1.25), key(frame=1.75)]}, "has no whole frame from 1.25 to 1.75"),
-        ({"keys": [key(), key(frame=1e9)]}, "has the frames 1 to 1e+09, expected at most 100,000"),
+        ({"keys": [key(), key(frame=1e9)]}, "has the frames 1 to 1,000,000,000, expected at most 100,000 frames"),
         ({"loop_frames": 4}, "'loop_frames' is 4, expected more than the 4 that the keys span"),
         ({"keys": [key(position=None)]}, "key 0: has no 'position', expected a list of 3 numbers"),
         ({"keys": [key(position=[1, 2, True])]}, "key 0: 'position' is [1, 2, True], expected a list of 3 numbers"),

@@ -173,7 +173,7 @@ def test_one_camera_of_several(stage: Path) -> None:
         (
             "endTimeCode = 1005",
             "endTimeCode = 1e12",
-            "/rig/shot: has the time codes 1001 to 1e+12, expected at most 100,000",
+            "/rig/shot: has the time codes 1,001 to 1,000,000,000,000, expected at most 100,000 time codes",
         ),
     ],
 )

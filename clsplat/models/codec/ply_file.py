@@ -48,7 +48,8 @@ NEAR_PLANE_COMMENT = ["comment", "clsplat", "near"]
 ANTIALIASED_COMMENT = ["comment", "SplatRenderMode:", "mip"]
 """Comment of an antialiased model, as Brush and other programs write it."""
 ALONG_RAYS_COMMENT = ["comment", "clsplat", "rays"]
-"""Comment of a model that perspective cameras draw along rays (`Gaussians.by_rays`)."""
+"""Comment in the PLY header of a model whose Gaussians perspective cameras evaluate along each pixel's ray, and do not
+project to ellipses (`Gaussians.by_rays`)."""
 
 
 @dataclass

@@ -52,10 +52,11 @@ PERCENTAGE_MAXIMA = (40.0, 100.0)
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0
-"""Ratio of the spread above the median to the spread below it, above which values are lengths and not logs.
+"""Ratio of (99th percentile - median) to (median - 1st percentile), above which values are lengths and not logs.
 
-Lengths vary by a factor of e or more on both sides of the median, which gives a ratio of 10. The spread of logs is
-about equal on both sides.
+The logs of a model's lengths have a standard deviation of 1 or more. If they are normally distributed, the ratio of the
+lengths is then e^2.33 = 10 or more (the 99th percentile is 2.33 standard deviations above the median), and the ratio of
+the logs is about 1.
 """
 
 
@@ -155,7 +156,7 @@ def _seen_opacities(logits: Float32) -> str:
     if white == 1 and not _spread(logits):
         return ""
     kind = {1.0: "opacities from 0 to 1", 100.0: "percentages"}.get(white, "levels")
-    return f"all opacities lie in {low:.3g} to {high:.3g}, as {kind} do,"
+    return f"all opacities are between {low:.3g} and {high:.3g}, as {kind} are,"
 
 
 def _spread(opacities: Float32) -> bool:
@@ -192,7 +193,7 @@ def _seen_scales(log_scales: Float32) -> str:
     )
     if p0 == p100 or (p50 >= 1 and p99 - p50 <= LENGTH_SKEW_RATIO * (p50 - p1)):
         return ""
-    return f"all scales lie in {p0:.3g} to {p100:.3g}, half of them under {p50:.3g}, as lengths do,"
+    return f"all scales are between {p0:.3g} and {p100:.3g}, half of them under {p50:.3g}, as lengths are,"
 
 
 def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.intp], where: Path | str) -> Gaussians:

@@ -80,8 +80,8 @@ class Section:
 def read(path: Path) -> Gaussians:
     """Read a .ksplat file.
 
-    Raises InputError for another version or level, a truncated file, inconsistent counts, or negative scales of a few
-    Gaussians (`values.all_to_log_scales`).
+    Raises InputError for another version or level, a truncated file, inconsistent counts, or negative scales of only a
+    few Gaussians; if many are negative, all are read as logs (`values.all_to_log_scales`).
     """
     with open_input(path, "a .ksplat file") as file:
         size = os.fstat(file.fileno()).st_size

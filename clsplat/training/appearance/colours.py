@@ -49,11 +49,13 @@ START_GAIN_STEP_OCTAVES = 2.0**-10
 them."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
-"""Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
+"""Weights of two terms that are added to the loss's gradient, per octave of distance. They pull the gains towards their
+initial values, which are computed from the colours of the scene's points.
 
 The first pulls the gains of each photograph. The second pulls the part that gains of neighbouring photographs have in
-common. Without the second, neighbours may all become slightly too bright, where no other photograph shows a dark
-surface. A photograph without gains from points is not pulled, because that would hold its gains at the mean.
+common. Without the second, a group of neighbouring photographs can drift too bright together, if no photograph outside
+the group shows the same dark surface. A photograph whose initial gains do not come from points is not pulled, because
+that would hold its gains at the mean.
 """
 
 GAIN_RATE_END_FRACTION = 0.001
@@ -77,7 +79,8 @@ _COLOUR_UPDATE = GainEntries(mix_rate=MIX_RATE_FRACTION)
 
 @dataclass(frozen=True, eq=False)
 class ViewColours(ViewPart):
-    """Parameters (entries) of the colour model for one photograph and its lens, as a part of one training step.
+    """The colour model's part in one view of a training step: which photograph's and lens's entries it reads and
+    updates, and at which learning rates.
 
     colours, lenses: entries of all photographs, and of all lenses; `lenses` is None if lenses have no entries in the
         colour model.

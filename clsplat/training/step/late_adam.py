@@ -44,7 +44,8 @@ class LateAdam(Component):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian on the device, for the number of the last step that it took."""
+        """Device memory in bytes per Gaussian: the component stores for each the number of the last step that the
+        Gaussian took."""
         return 4
 
     def is_due(self, step: int, views: int) -> bool:

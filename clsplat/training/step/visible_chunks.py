@@ -293,7 +293,7 @@ class VisibleChunks(Component):
         return hidden, hidden(longest)
 
     def _mean_and_scale_rates(self, steps: range) -> Float64:
-        """Upper limits (2, 1) of the learning rates of means and log scales in these steps."""
+        """Upper limits (2, 1) of the learning rates of means and log scales in the steps with the numbers `steps`."""
         rates = largest_rates(self._config, steps, self._unit)
         return np.array([[rates["means"]], [rates["log_scales"]]])
 
