@@ -239,7 +239,7 @@ def wanted_table(measured: Sequence[Measured], constants: Constants, now: Works)
         ms = milliseconds(now[gpu.name, frame], gpu, constants)[WALLS[1]]
         then, error = "not counted", "not measured"
         for each in measured:
-            if (each.gpu.name, each.frame) == (name, frame):
+            if (each.gpu.name, each.frame) == (name, frame) and WALLS[1] in each.ms:
                 ratios = {part: found / each.ms[part] for part, found in each.predicted(constants).items()}
                 of_parts = [math.log(ratio) ** 2 for part, ratio in ratios.items() if part not in WALLS]
                 then = f"{each.predicted(constants)[WALLS[1]]:.2f}"

@@ -7,7 +7,7 @@
 gsplat: https://github.com/nerfstudio-project/gsplat, with torch's fused Adam. Faster-GS: FasterGSFusedCudaBackend of
 https://github.com/nerficg-project/faster-gaussian-splatting, which has Adam in its backward pass. The loss of both is
 L1 + D-SSIM by the package fused_ssim, or L1 alone if that cannot be imported. Learning rates are 0 in gsplat; Faster-GS
-has constant ones. Both run on CUDA alone, and have not been run by this tool yet.
+has constant ones. Both run on CUDA alone. This tool has run them on an H200.
 """
 
 from __future__ import annotations

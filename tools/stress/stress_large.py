@@ -184,7 +184,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     print(
         f"{count:,} Gaussians of degree {arguments.degree}, {'dense' if arguments.dense else 'sparse'} Adam, "
-        f"{arguments.steps} steps: {times['median_ms']:.0f} ms a step (median), {times['mean_ms']:.0f} (mean), "
+        f"{arguments.steps} steps: {times['median_ms']:.2f} ms a step (median), {times['mean_ms']:.2f} (mean), "
         f"{times['processor_ms']:.0f} of all threads (median), "
         f"{moved / arguments.steps / 2**20:.0f} MiB moved a step, {made:.0f} s to begin, {caught:.0f} s to catch up, "
         f"peak {peak.bytes / 2**20:,.0f} MiB, digest {text}"
