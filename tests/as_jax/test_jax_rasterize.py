@@ -220,7 +220,7 @@ def test_counts(default_device: Device, count: int) -> None:
         ("near_plane", np.nan, "near_plane is nan, expected"),
         ("eps2d", -1, "eps2d is -1, expected"),
         ("alpha_max", 2.0, "alpha_max is 2.0, expected"),
-        ("sh_degree", 7, "sh_degree is 7, expected 0 to 4, or None"),
+        ("sh_degree", 7, "sh_degree is 7, expected a whole number from 0 to 4, or None"),
         ("width", [40, 20], r"width is \[40, 20\], expected a whole number"),
     ],
 )

@@ -257,7 +257,10 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--workers 2 --device all", "--device all and --workers exclude each other"),
         ("--scheduler tcp://a:1 --device 0,1", "--device 0,1 and --scheduler exclude each other"),
         ("--device 0,abacus", "--device abacus: no such device"),
-        (f"-o {tmp_path}/new/a.exr", "expected one to tell 6 cameras apart, or a frame number such as ####"),
+        (
+            f"-o {tmp_path}/new/a.exr",
+            "names a single file for 6 frames, expected {name} or a frame number such as ####",
+        ),
         (f"-o {tmp_path}/new/#.png --channels rgb,depth", "a PNG cannot hold depth; write .exr"),
         (f"-o {tmp_path}/file/#.png", "file: is a file, expected a folder"),
     ]

@@ -314,7 +314,7 @@ def test_strips(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     assert render_shot(shot, tmp_path / "little", little) == 0
     assert contents(tmp_path / "little") == contents(tmp_path / "plenty")
     assert render_shot(shot, tmp_path / "parts", f"{little} --parts several") == 2
-    assert "--parts several: a picture of 960x800 is written in strips" in error_line(capsys)
+    assert "--parts several: a picture of 960x800 is too large to be written at once" in error_line(capsys)
     assert not (tmp_path / "parts").exists()
 
 

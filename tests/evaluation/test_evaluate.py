@@ -128,5 +128,5 @@ def test_pixels_that_a_mask_leaves_out_are_not_measured() -> None:
 
 def test_a_mask_that_leaves_nothing_is_named() -> None:
     view = Photo("a.png", np.zeros((30, 40, 5), np.float32))
-    with pytest.raises(InputError, match=r"a\.png: its mask leaves nothing"):
+    with pytest.raises(InputError, match=r"a\.png: its mask excludes all pixels"):
         evaluate(lambda v: v.pixels[:, :, :3], [view], (0, 0, 0), model=EvaluatedModel(1, 1, 0.0))

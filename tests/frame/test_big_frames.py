@@ -122,7 +122,7 @@ def test_rows_of_a_strip() -> None:
 
 def test_what_cannot_be(tmp_path: Path) -> None:
     draw = drawn_by(Renderer(), CLOUD)
-    with pytest.raises(InputError, match="--parts several: a picture of 150x200 is written in strips"):
+    with pytest.raises(InputError, match="--parts several: a picture of 150x200 is too large to be written at once"):
         write_in_strips(tmp_path / "a.exr", draw, CAMERA, ("rgb",), 16, Encoding(parts="several"))
     refuses("no such folder", write_in_strips, tmp_path / "none" / "a.exr", draw, CAMERA, ("rgb",), 16)
 

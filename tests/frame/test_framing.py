@@ -166,7 +166,7 @@ def test_a_camera_gets_the_window_of_another() -> None:
     assert (again.width, again.height, again.fx, again.cx) == (30, 40, part.fx, part.cx)
     assert again.window == part.window
     assert camera.reframed(camera).window is None
-    refuses("edges on whole pixels", part.resized, 31, 40, error=ValueError)
+    refuses("edges at whole pixels", part.resized, 31, 40, error=ValueError)
 
 
 @pytest.mark.parametrize(

@@ -335,7 +335,7 @@ def test_a_map_that_points_nowhere_is_told(shot: list[str], tmp_path: Path, caps
     places[:, : WIDTH // 2] = np.nan
     write_stmap(tmp_path / "map.exr", places, WIDTH, HEIGHT)
     assert render(shot, tmp_path / "a.exr", f"--stmap {tmp_path}/map.exr") == 0
-    assert "position in the undistorted picture, or one more than a frame's size outside it" in capsys.readouterr().err
+    assert "the undistorted picture does not contain what these pixels show" in capsys.readouterr().err
     assert not np.asarray(oiio.ImageBuf(str(tmp_path / "a.exr")).get_pixels(oiio.FLOAT))[:, : WIDTH // 2].any()
 
 

@@ -227,7 +227,7 @@ def test_a_cloud_that_does_not_read_or_lies_elsewhere_is_told_and_passed_over(tm
     assert len(scene.points) == 0
     assert len(scene.warnings) == 2
     assert "points3d.ply" in scene.warnings[0]
-    assert "at a distance of 1e+06 from the cameras that see them" in scene.warnings[1]
+    assert "their distance from the cameras that see them is 1e+06" in scene.warnings[1]
     assert all(text.endswith("; it is not used") for text in scene.warnings)
     assert not [text for text in sanity_checks.of_scene(scene, "black") if "points of its own" in text]
 

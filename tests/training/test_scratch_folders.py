@@ -115,7 +115,7 @@ def test_a_checkpoint_that_names_another_file(go: Train, tmp_path: Path, monkeyp
     path.rename(precious)
     before = precious.read_bytes()
     with (
-        pytest.warns(UserWarning, match="precious, expected a scratch file"),
+        pytest.warns(UserWarning, match="precious, expected a file "),
         pytest.raises(InputError, match="no intact checkpoint"),
     ):
         go()

@@ -28,7 +28,7 @@ STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2
 SLANT_RADIANS = math.radians(40.0)
 """Angle of the oblique cameras' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
-"""Distortion k1 to k4 of the OPENCV_FISHEYE lens, with which street cameras of the rig "fisheye" photograph."""
+"""Distortion k1 to k4 of the OPENCV_FISHEYE lens, with which street cameras of the fisheye rig photograph."""
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
 """Fractions of a block's photographs that look straight down, and that are taken in streets. The rest is oblique."""
 DIRECTIONS: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
