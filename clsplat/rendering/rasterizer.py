@@ -212,12 +212,10 @@ class Rasterizer:
         nearness: bool = False,
         chunks: ChunkList | ChunkNumbers | None = None,
     ) -> ForwardPass:
-        """Render a frame: project the Gaussians, list those of each tile by depth, and blend them.
-
-        See Kerbl et al. 2023, algorithm 2.
+        """Render a frame (Kerbl et al. 2023, algorithm 2): project the Gaussians, list them by tile and depth, blend.
 
         background: (3,) float32, on the host or the device; or the two arrays that `send` or `keep` returned.
-        backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
+        backward: True if a gradient will follow.
         room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.

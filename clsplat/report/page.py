@@ -80,15 +80,13 @@ def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
 
 
 def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: int = MAX_PICTURED_VIEWS) -> str:
-    """Build the HTML of a run's report.
+    """Build the HTML of a run's report, with pictures of at most `views` held-out views.
 
     scene: the run's scene, or the reason why there is none. None loads the scene if it is needed.
-    views: maximum number of held-out views with pictures.
     """
     evaluation = numbers.evaluation
     listed = evaluation["views"] if evaluation else []
-    shown: list[thumbnails.Shown] = []
-    low: list[thumbnails.Shown] = []
+    shown, low = list[thumbnails.Shown](), list[thumbnails.Shown]()
     notes = list(numbers.notes)
     use = numbers.run.config.mask_use
     if views > 0 and (listed or use != NO_MASKS):

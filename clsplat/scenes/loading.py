@@ -63,8 +63,7 @@ def load_scene(
     path: a folder in a layout that `detect` knows, or a transforms.json.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
-    test_most: maximum number of views that `test_every` holds out. If it is exceeded, an evenly spaced selection of
-        them is held out. 0 for no maximum.
+    test_most: maximum number of views that `test_every` holds out; of more it takes an even selection. 0: no maximum.
     images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
         images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
         Such a folder of any size is used if there are no other pictures.
@@ -73,8 +72,7 @@ def load_scene(
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in masked pixels.
-    missing: how many listed pictures may be missing, "few" (a tenth), "skip" (any number but not all) or "error"
-        (none).
+    missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
 
     A folder of photographs goes through `clsplat.scenes.sfm.reconstruct` first. An earlier result for the same
     photographs is reused.

@@ -369,7 +369,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     """Return a digest of everything that a frame depends on, except the model file.
 
     It includes cameras, channels, encoding, picture settings, rasterizer settings, the content of the holdout's file,
-    and the models' placements; for models with one file per frame also the content of these files.
+    and the models' placements. For models with one file per frame it includes the content of these files.
     """
     pictures, sampling = options.pictures, sampling_of(task, options.pictures)
     encoding = {

@@ -133,8 +133,7 @@ def run_tasks(
 
     Each renderer has a thread, which takes frame after frame. The first error is raised when all threads have ended.
 
-    on_done: function that is called in this thread with the record of each frame whose file is complete, in any order.
-        For a video it is called in the frames' order, when the frame has been encoded.
+    on_done: called in this thread with the record of each frame whose file is complete; for a video, in their order.
     shared: True if other jobs may render some of these frames. Each frame is then claimed before it is rendered.
     """
     if not tasks:

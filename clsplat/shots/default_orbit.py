@@ -150,7 +150,7 @@ def _size(size: tuple[int | None, int | None]) -> tuple[int, int]:
 
 
 def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
-    """Return the centre (3,) in the world and the radius of the model's part that an orbit shows: the most detailed
+    """Return the centre (3,) in the world and the radius of the part that an orbit shows: the most detailed
     region of a scene, or an object without its outliers.
 
     A ball shrinks towards the greatest detail, measured as opacity over size (mean shift, Fukunaga and Hostetler 1975),

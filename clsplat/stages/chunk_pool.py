@@ -146,7 +146,7 @@ class ChunkPool:
     def read_ahead(self, camera: Camera) -> None:
         """Begin to read, from a scratch file, the chunks that a camera may show and that are not on the device.
 
-        If no chunk has crossed the bus since the last call, nothing is read: the chunks of all views are then probably
+        If no chunk has crossed the bus since the last call, nothing is read. The chunks of all views are then probably
         on the device, and culling would take time for nothing.
         """
         if self.moved_bytes > self._moved_before and self.cull is not None and self.store.path is not None:

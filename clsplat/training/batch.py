@@ -391,7 +391,7 @@ class Batch:
     def _take(
         self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
     ) -> Loss:
-        """Add the gradients of a view that a further device computed to the sums, and its other results to the density
+        """Add to the sums the gradients that a further device computed, and its other results to the density
         statistics, by way of scratch arrays on the first device. Returns the view's loss.
 
         parameters: the model's parameters. A streamed model comes to the device in parts, each with the density

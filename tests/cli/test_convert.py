@@ -48,9 +48,8 @@ def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
     assert f"{target}: splat, 300 Gaussians of SH degree 0, 9,600 bytes" in said
     for name in ("position", "scale", "rotation", "opacity", "colour", "SH"):
         assert f"\n{name} " in said
-    found = told(capsys, "convert", model, target, "--overwrite")
+    errors = (found := told(capsys, "convert", model, target, "--overwrite"))["errors"]
     whole, read = Gaussians.load(model), Gaussians.load(target)
-    errors = found["errors"]
     assert errors["position"]["largest"] == 0
     assert errors["sh"]["largest"] == pytest.approx(np.abs(whole.sh[:, 1:]).max())
     p, q = (each.quaternions / np.linalg.norm(each.quaternions, axis=1)[:, None] for each in (whole, read))

@@ -187,3 +187,9 @@ def assert_alike(one: Stepped, other: Stepped) -> None:
 def opened_again(device: Device) -> Device:
     """The device with another context, queue and kernels, as another thread needs them."""
     return Device(device.cl_device, device.shape)
+
+
+def state(trainer: Trainer) -> State:
+    """All arrays of a checkpoint, with those of Gaussians that are in a scratch file."""
+    saved = {name: array.copy() for name, array in trainer.checkpoint()[0].items() if not name.startswith("chunks/")}
+    return saved | trainer.model.arrays()

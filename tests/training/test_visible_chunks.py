@@ -15,7 +15,7 @@ from calls import noted
 from compare import assert_same_bits
 from pipeline import shaped
 from quick import quick
-from same_bytes import State, make_too_small, outcome, stopped
+from same_bytes import State, make_too_small, outcome, state, stopped
 from tiny import cameras, run_steps, short
 from wide import ROWS, let_small_models_have_chunks, start_wide, wide_model
 
@@ -70,12 +70,6 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     monkeypatch.setattr(VisibleChunks, "join", join)
     return found
-
-
-def state(trainer: Trainer) -> State:
-    """All arrays of a checkpoint, with those of Gaussians that are in a scratch file."""
-    saved = {name: array.copy() for name, array in trainer.checkpoint()[0].items() if not name.startswith("chunks/")}
-    return saved | trainer.model.arrays()
 
 
 def trained(

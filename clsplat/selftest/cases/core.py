@@ -203,8 +203,9 @@ def _blend_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
-    """Compute from the twin's gradients the sums (n, 6) that the slots of each Gaussian must add up to: of g, and the
-    first and second moments of g, by equations (49) and (25) to (29) of docs/gradients.md.
+    """Compute from the twin's gradients the sums (n, 6) that the slots of each Gaussian must add up to.
+
+    They are sums of g, and the first and second moments of g, by equations (49) and (25) to (29) of docs/gradients.md.
 
     wanted: the twin's gradients with respect to the projected Gaussians `splats`.
     """

@@ -30,7 +30,7 @@ NEIGHBOUR_WEIGHT_STEP = 2.0**-20
 
 
 def places(cameras: Sequence[Camera]) -> Float64:
-    """Return a point (n, 6) for each camera, to measure distances between cameras: its position relative to the middle
+    """Return points (n, 6), to measure distances between cameras: a camera's position relative to the middle
     of all positions, in units of the median distance from there, and its viewing direction. If all positions differ
     only by rounding, they count as equal."""
     centres = np.array([camera.position for camera in cameras])
