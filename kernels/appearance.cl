@@ -43,8 +43,8 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    // apart: the sum of logs - start over all photographs whose gains are pulled; told: the number of these
-    // photographs.
+    // apart: the sum of (logs - start) over the photographs with a row in the sparse matrix, whose gains are pulled
+    // towards `start`; told: the number of these photographs.
     float told = 0.0f, apart = 0.0f, pull = 0.0f;
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);

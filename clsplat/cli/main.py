@@ -83,7 +83,7 @@ def _run(arguments: list[str], services: Services) -> int:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error, joined to one line."""
+    """Return the message of an error, joined into one line."""
     if isinstance(error, OSError) and not isinstance(error, ClsplatError):
         return system_trouble(error)
     if isinstance(error, MemoryError) and not isinstance(error, ClsplatError):

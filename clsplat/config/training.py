@@ -127,7 +127,7 @@ class DensityConfig:
     """Prune Gaussians that covered a larger radius than this on the screen, in pixels, after the first opacity reset; 0
     prunes none."""
     opacity_reset_every: int = 3000  # opacity_reset_interval, reset_every
-    """Steps between opacity resets; 0 for none. A white background adds a reset at density.start."""
+    """Steps between opacity resets, until density.stop; 0 for none. A white background adds one at density.start."""
     opacity_reset_to: float = 0.01
     """Maximum opacity after a reset."""
     max_gaussians: int = 10_000_000  # cap_max

@@ -165,7 +165,7 @@ class Device:
     def with_switches(self, switches: Mapping[str, object]) -> Device:
         """Copy this device, with the same queue. The copy passes these defines to kernel files that contain them."""
         device = copy(self)
-        device._switches = {**self._switches, **switches}  # noqa: SLF001  # a copy of our own class
+        device._switches = {**self._switches, **switches}  # noqa: SLF001  # the copy is of this class
         return device
 
     @property

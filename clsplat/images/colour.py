@@ -282,7 +282,7 @@ def configuration_digest(source: str) -> str:
 
 
 @lru_cache(maxsize=8)
-def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # `changed` is a key of the cache
+def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # `changed` is part of the cache's key
     """Return glob patterns for the files that the FileTransforms in an OpenColorIO configuration may read.
 
     There is a pattern for each file name in each folder of the configuration's search_path, with "*" in place of

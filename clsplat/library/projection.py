@@ -307,7 +307,7 @@ def checked_cameras(
     """Return the cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or the camera of (4, 4) and (3, 3).
 
     width, height: in pixels; a number for all cameras, or one for each.
-    planes: the settings that all cameras share.
+    planes: near and far plane, low-pass filter, culling radius and camera model, which all cameras share.
     Raises InputError, which names the argument.
     """
     poses = matrices("viewmats", viewmats, 4, "C")

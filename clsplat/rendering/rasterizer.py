@@ -266,8 +266,8 @@ class Rasterizer:
     ) -> tuple[AnyGaussians, ChunkList | ChunkNumbers | None]:
         """Find the chunks of a streamed model that the camera may show. Returns the model and the chunks to project.
 
-        If the pool has slots for these chunks, the result is the pool's rows and the chunks' slots. If it has too few,
-        it is the whole model and the chunks' numbers. If the pool cannot find them, it is the whole model and None.
+        They are the pool's rows and the chunks' slots if the pool has slots for these chunks; otherwise the whole model
+        and the chunks' numbers. Without culling (`pool.cull` is None) they are the whole model and None.
         """
         if pool.cull is None:
             return gaussians, None

@@ -34,7 +34,7 @@ MIN_POSE_CHECK_POINTS = 30
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
 """Thresholds for suggesting another convention of the poses (POSE_MISREADINGS).
 
-Another convention is suggested if with it, views show on average at least the first fraction of the points, and at
+Another convention is suggested if, with it, views show on average at least the first fraction of the points, and at
 least the second number times the fraction that they show with the poses as given. The first threshold excludes aerial
 surveys, where a picture shows about 1 % of the points with either convention.
 """

@@ -107,11 +107,14 @@ of hand-held photographs."""
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed path of two turns that rises and sinks over the cameras' range of heights, facing their focus point.
 
-    Coordinates are spherical about `focus_point`. At the cameras' median distance, the path goes from the 10th to the
-    90th percentile of their elevations and back. If the cameras leave a wide gap, the azimuth swings over the arc that
-    they cover, once per turn, a quarter turn behind the elevation. The path is then an ellipse in front of the scene,
-    and its distance, too, goes from the 10th to the 90th percentile and back. Intrinsics are the first camera's.
-    Raises ValueError for no cameras or no frames.
+    Coordinates are spherical about `focus_point`. If the cameras stand all around it, the path makes two full turns at
+    their median distance, while its elevation goes once from the 10th to the 90th percentile of theirs and back.
+
+    If they leave a wide gap, the path is an ellipse in front of the scene, run through twice. In each round azimuth and
+    elevation go once to and fro over the arc and the percentiles that the cameras cover. The distance goes to and fro
+    once in the whole path, between the same percentiles.
+
+    Intrinsics are the first camera's. Raises ValueError for no cameras or no frames.
     """
     _check("spiral", cameras, frames)
     ring = _ring(cameras)

@@ -60,7 +60,8 @@ class Projected:
 
     @property
     def chunk_defines(self) -> dict[str, object]:
-        """Macros for kernels that run over the projected Gaussians and read or write the model's arrays."""
+        """Defines for kernels that run over the projected Gaussians and index the model's arrays: CHUNKS if only some
+        chunks were projected, so that the kernel finds rows by the list of chunks."""
         return {} if self.chunks is None else {"CHUNKS": True}
 
     @property

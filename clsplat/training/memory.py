@@ -153,7 +153,7 @@ class HostMemory:
         if self.files is None:
             raise InputError(
                 f"--max-host-mem {amount(self.limit or 0)} has no room for {amount(nbytes)} of Gaussians: name a "
-                "folder for a file of them (--scratch DIR), or a run's folder (-o)"
+                "folder for a scratch file (--scratch DIR), or a run's folder (-o)"
             )
         return self.files.new_file()
 

@@ -171,7 +171,7 @@ def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
 
 
 def looking(start: Start, size: tuple[int, int]) -> Pose:
-    """Return the pose of a newly opened page of this size, in pixels."""
+    """Return the camera's pose in a newly opened page. start: the first view; size: width and height in pixels."""
     rotation, _ = look_at(start.position, start.target, start.up)
     return Pose(rotation.T, start.position, start.fov_on(*size), *size)
 

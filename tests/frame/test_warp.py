@@ -279,7 +279,7 @@ def test_skip_existing_goes_by_the_map(shot: list[str], tmp_path: Path, capsys: 
         ("--stmap GIVEN --overscan 4", "covers 96x64 pixels from 0,0 on, expected all of the picture"),
         ("--stmap GIVEN --channels motion", "--stmap: motion is not defined for distorted pictures"),
         ("--stmap WHOLE", "WHOLE: has R, G, B as uint8, expected an STMap's R and G as floats"),
-        ("--distort", "describes no photographs with lenses, expected a COLMAP model's folder or a transforms.json"),
+        ("--distort", "distortion, expected a COLMAP model's folder or a transforms.json"),
         ("--distort --stereo 0.1", "--stereo and --distort exclude each other"),
         ("--distort --path turntable", "--distort: applies to the photographs' own cameras, expected it without"),
     ],
@@ -343,5 +343,5 @@ def test_stmaps_of_cameras_that_do_not_bend(shot: list[str], tmp_path: Path, cap
     (tmp_path / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 90 90 48 32\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 photo.png\n\n")
     assert "its lenses have no distortion" in rejected(capsys, ["stmaps", tmp_path, "-o", tmp_path / "maps"])
-    assert "describes no photographs with lenses" in rejected(capsys, ["stmaps", shot[2], "-o", tmp_path / "maps"])
+    assert "has no cameras of photographs with" in rejected(capsys, ["stmaps", shot[2], "-o", tmp_path / "maps"])
     assert not (tmp_path / "maps").exists()

@@ -12,8 +12,8 @@ another, each for all Gaussians: positions, alphas, colours, scales, rotations, 
 - Scales: natural logs in steps of 1/16, -10 to 5.94.
 - Rotations: x y z w. Version 2 stores x y z in steps of 1/127.5, with w positive. Later versions leave out the largest
   component and store its index in 2 bits. The others take 10 bits each: a sign, and steps of 1/723.
-- SH: order and signs are clsplat's; red, green and blue of a coefficient are adjacent. Values are in steps of 1/128
-  within +-1. Writers round to fewer bits for better compression.
+- SH: the basis functions, their order and signs are clsplat's, in the file's axes. Red, green and blue of a
+  coefficient are adjacent. Values are in steps of 1/128 within +-1. Writers round to fewer bits for better compression.
 """
 
 from __future__ import annotations

@@ -211,8 +211,8 @@ def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa:
         # The bound covers one rounding of the sum, and a few roundings of the movement.
         # The betas in float32 are off by 3e-8, which changes a sum over some 30 steps by 1e-6 of it.
         "parameters": Expected(parameters, 3e-6, moves),
-        "first": Expected(first, 2e-5, np.abs(first)),  # beta1 is off by 2.6e-8, its power after 256 steps by 7e-6
-        "second": Expected(second, 1e-5, second),  # beta2 is off by 1.3e-8, its power after 256 steps by 3e-6
+        "first": Expected(first, 2e-5, np.abs(first)),  # float32 beta1 is off by 2.6e-8, beta1^256 by 7e-6
+        "second": Expected(second, 1e-5, second),  # float32 beta2 is off by 1.3e-8, beta2^256 by 3e-6
         "last": exactly(np.where(taken, mark, given.last).astype(np.uint32)),
     }
 

@@ -149,7 +149,7 @@ class CameraGate:
         found = f"{flag}: held-out views had {best:.2f} dB at step {at}, but {figures} dB at steps {steps}"
         advice = f"try a smaller {reach}, or train without {flag}"
         if step >= self._config.iterations:
-            return None, f"{found}: the last cameras are kept, as no step is left to train with earlier ones; {advice}"
+            return None, f"{found}: the latest cameras are kept, as no step is left to train with others; {advice}"
         self.ended = step
         return self._best, f"{found}: the cameras of step {at} are restored, and refinement ends; {advice}"
 

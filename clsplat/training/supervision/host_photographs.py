@@ -161,7 +161,8 @@ class HostPhotographs:
             self._bytes -= self._held.pop(key).nbytes
 
     def _enter(self, factor: float) -> None:
-        """When the size changes, evict photographs of earlier sizes. With a limit, evict all other sizes."""
+        """When the size changes, evict photographs of earlier sizes. With a limit on memory, evict those of later sizes
+        too, which were read ahead."""
         if factor == self._factor:
             return
         self._factor = factor

@@ -70,8 +70,8 @@ typedef struct {
   float p[3], q[3], d[3];
 } Moved;
 
-// Moves the mean (x, y, z), seen by `camera`, to the mean `to`, seen by `after`: fills *m. Returns 0 if the moved mean
-// is nearer than the near plane of `after`.
+// Computes the motion of a mean in the camera's axes, in *m: from (x, y, z) seen by `camera` to `to` seen by `after`.
+// Returns 0 if the mean is, after the motion, nearer than the near plane of `after`, or too far away (1e15).
 static inline int move(__constant float *camera, __constant float *after, float x, float y, float z,
                        __global const float *to, Moved *m) {
   const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, to[0], to[1], to[2]);
