@@ -50,7 +50,7 @@ MAX_OCCLUSION_CELL_FRACTION = 1 / 25
 
 @cache
 def colmap_camera_models() -> dict[int, tuple[str, int]]:
-    """Return name and number of parameters of each camera model that pycolmap knows, such as SIMPLE_RADIAL. The keys
+    """Return name and number of parameters of each camera model that pycolmap knows, such as PINHOLE. The keys
     are COLMAP's ids."""
     known = {}
     for name, member in pycolmap.CameraModelId.__members__.items():
