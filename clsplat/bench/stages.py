@@ -113,8 +113,10 @@ def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
 
 
 def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:
-    """Return a record for each stage: measurements, rates of bytes and pairs, and rates as fractions of the limits.
+    """Return a record for each stage: its measurements, bytes and pairs per second, and these rates as fractions of
+    the device's limits.
 
+    limits: the device's rates of copying and of blending pairs, which stages are compared with.
     contributing: number of (pixel, Gaussian) pairs that change a pixel.
     """
     table: dict[str, dict[str, Any]] = {}

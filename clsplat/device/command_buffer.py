@@ -130,7 +130,7 @@ class CommandBuffer:
         self._described.append((kernel.name, kernel.variant, size, local, *description))
 
     def set(self, numbers: Iterable[float], given: Sequence[cl.Buffer] = ()) -> None:
-        """Set the arguments that change from replay to replay, before a replay.
+        """Set the arguments that are different in each replay. Call it before the replay.
 
         numbers: values of the launch parameters, in order of the recorded launches.
         given: buffers in place of those that were `given` when the command buffer was made.

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour spaces (sRGB, linear, OpenColorIO's): conversion between those of the model, of light and of output files.
+"""Colour spaces (sRGB, linear, OpenColorIO's): conversion between the model's space, linear light, and the space of
+output files.
 
 Gaussians are blended in the colour space of their training photographs. Operations that add light (filters, shutter,
 lens) work on linear values. OpenColorIO converts the output, by default with the configuration built into OpenImageIO.

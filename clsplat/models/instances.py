@@ -183,9 +183,9 @@ def near_of(models: Sequence[Gaussians | ModelSeries], state: State) -> float:
 
 
 class Ensemble:
-    """Merges the models of a shot, placed by one `State` after another. Not thread-safe.
+    """Places the models of a shot by a `State` and merges them into one model, for one state after another.
 
-    Models whose placement is unchanged since the last state are reused.
+    A model whose placement is that of the last state is not placed again. Not thread-safe.
     """
 
     def __init__(self, models: Sequence[Gaussians | ModelSeries]) -> None:

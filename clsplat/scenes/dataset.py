@@ -62,7 +62,8 @@ def colmap_camera_models() -> dict[int, tuple[str, int]]:
 
 @cache
 def lens_models() -> dict[str, tuple[LensModel, CameraModel]]:
-    """Return the lens models of all camera models, each with its camera model. The keys are the lens models' names."""
+    """Return, by the name of each lens model (such as COLMAP's OPENCV_FISHEYE), the lens model and the camera model
+    that has it."""
     return {lens.name: (lens, model) for model in CAMERA_MODELS for lens in model.lenses}
 
 

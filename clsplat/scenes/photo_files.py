@@ -17,7 +17,8 @@ DOWNSCALED_FOLDER_FACTORS = (2, 4, 8)
 """Factors by which the sides of downscaled pictures are divided, such as 2 in the folder images_2. Folders with these
 factors are used if pictures of exactly their size are requested."""
 FALLBACK_FOLDER_FACTORS = range(2, 65)
-"""Factors, likewise, of folders that are recognised as downscaled copies, and used if there are no other pictures."""
+"""Factors, such as 3 in images_3, by which a folder is recognised as a downscaled copy. Such folders are used only if
+there are no other pictures."""
 MAX_MISSING_FRACTION = 0.1
 """Maximum fraction of missing pictures by default, as users delete some or do not copy all.
 

@@ -236,8 +236,8 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Return the host array for result `name` of this device's view number `place` of the batch. It is reused from
-        step to step, because allocating fresh memory would take as much time as the copy."""
+        """Return the host array that takes the result `name` of a view. place: the view's position among this device's
+        views of the batch. The array is reused in each step: fresh memory would take as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)

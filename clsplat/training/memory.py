@@ -84,7 +84,9 @@ class HostMemory:
         run: Run | None,
         scratch: str | Path | None = None,
     ) -> HostMemory:
-        """Make the limit and folders that these arguments of `clsplat.train` ask for. Raises InputError.
+        """Return the limit of main memory and the folders that these arguments of `clsplat.train` ask for.
+
+        Also sets `run.scratch_path`. Raises InputError.
 
         max_host_mem: the limit, in bytes or as a text such as "8GiB"; None for no limit.
         cache: a folder, or "none" for no cache. None stands for RUN/cache if there is a limit, otherwise for no cache.

@@ -111,7 +111,8 @@ MODEL_FORMATS: tuple[Format, ...] = (
     Format("zipped model", (ZIP_SUFFIX,), _ZIPPED_MODEL.read, recognises=zipped.recognises,
            loses="clsplat does not write this format", describe=_ZIPPED_MODEL.describe, space=_ZIPPED_MODEL.space),
 )  # fmt: skip
-"""All formats. The first format that recognises a file's first bytes is used."""
+"""All formats. A file has the format of its suffix, unless its first bytes belong to others (`recognises`): then the
+first of them."""
 
 
 def suffixes(*, writable: bool = False) -> list[str]:

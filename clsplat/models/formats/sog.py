@@ -155,7 +155,7 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
     except ValueError:  # a zero byte in the name
         picture = folder
     if picture.parent != folder:
-        raise InputError(f"{path}: has a picture {name[:80]!r}, expected a name in the same folder")
+        raise InputError(f"{path}: has a picture {name[:80]!r}, expected a file in the same folder")
     if not is_file(picture) and is_file(other := folder / _match_case(picture.name, _names(folder))):
         return other
     if not is_file(picture):

@@ -331,7 +331,10 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
 
 
 def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
-    """Return the sine of the elevation above the horizon of the mean pixel of `part`, a mask (h, w) of the view."""
+    """Return the sine of the elevation above the horizon of the centroid of `part`, a mask (h, w) of the view.
+
+    up: (3,), the world's up direction.
+    """
     rows, columns = np.nonzero(part)
     camera = view.camera.resized(part.shape[1], part.shape[0])
     x, y = (columns.mean() + 0.5 - camera.cx) / camera.fx, (rows.mean() + 0.5 - camera.cy) / camera.fy

@@ -188,10 +188,10 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 
 
 def _like(path: Path) -> list[Path]:
-    """Return a sample of the masks in the folder of the mask `path`, about COMPARED_MASKS, evenly spaced.
+    """Return about COMPARED_MASKS evenly spaced masks from the folder of the mask `path`, which may be among them.
 
-    Photographs in the folder are left out. If the name of `path` contains "mask", only files with such names are masks,
-    otherwise only files with other names.
+    If the name of `path` contains "mask", all files whose names contain it count as masks, otherwise all files whose
+    names do not. This leaves out photographs in the same folder as masks.
     """
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]

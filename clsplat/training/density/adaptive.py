@@ -201,7 +201,7 @@ def draw_halves(
 ) -> dict[str, Float32]:
     """Draw the means and log scales of one half of each split Gaussian, for `RowPlan.halves`.
 
-    split: the groups SPLIT_GROUPS of the split Gaussians.
+    split: parameters of the Gaussians that are split, one array for each parameter group in SPLIT_GROUPS.
     second: not used, because both halves are drawn from the same distribution.
     """
     means, log_scales = split_halves(config, split, rng)
@@ -239,7 +239,7 @@ def split_halves(
 ) -> tuple[Float32, Float32]:
     """Return means (m, 3), drawn from the split Gaussians, and smaller log scales (m, 3): one half of each.
 
-    split: the groups SPLIT_GROUPS of the split Gaussians.
+    split: parameters of the Gaussians that are split, one array for each parameter group in SPLIT_GROUPS.
     """
     means, log_scales = split["means"], split["log_scales"]
     offsets = draw_offsets(split["quaternions"], log_scales, rng)
