@@ -330,7 +330,7 @@ def test_launches_for_their_twins(device: VariedDevice, tmp_path: Path, monkeypa
     assert (launch["local"], math.prod(launch["size"])) == ([64], 64 * 3 * 2)
     assert (int(first), int(tiles_x), int(width), int(height)) == (0, 3, 48, 32)
     assert ranges.view(np.uint32).reshape(-1, 2)[:6, 1].max() > 0
-    assert len(arrays) == 7
+    assert len(arrays) == 9, "the sorted list, splats, background, three planes, two of the parts of lists, the order"
     refuses("none of blend", trial_counters.measure, None, None, tmp_path / "x", 1, error=OSError)
 
 
