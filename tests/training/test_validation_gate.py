@@ -157,7 +157,7 @@ def test_the_warning_has_the_figures_and_a_way_on() -> None:
     lenses = replace(CONFIG, refine_poses=False, refine_lenses=True)
     assert judged([25, 24, 23], lenses)[1][0].endswith("try a smaller --lens-reach, or train without --refine-lenses")
     late = judged([*[25] * 8, 24, 24])[1]
-    assert "as no step is left to train with earlier ones" in late[0]
+    assert "as no step is left to train with others" in late[0]
 
 
 def test_the_bound_is_a_setting() -> None:
