@@ -67,7 +67,7 @@ def load_scene(
     """Load the scene in the folder `path`, print its warnings, and return it.
 
     test_views: (test_every, test_most), which choose the held-out views.
-    The other arguments are those of `clsplat.load_scene`.
+    Other arguments: as for `clsplat.load_scene`.
     """
     scene = services.load_scene(
         path,

@@ -133,7 +133,7 @@ class CommandBuffer:
         """Set the arguments that are different in each replay. Call it before the replay.
 
         numbers: values of the launch parameters, in order of the recorded launches.
-        given: buffers in place of those that were `given` when the command buffer was made.
+        given: buffers for this replay, in the order of `given` in the constructor.
         """
         values, old = self._format.pack(*numbers), self._set
         if values != old:

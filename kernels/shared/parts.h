@@ -7,8 +7,7 @@
 // and leave no gap. Some have no boundary.
 //
 // Buffers: states (pairs / PART_PAIRS, STATE_SIZE, TILE * TILE): the fields below; with STATE_SIZE 5 also STATE_NEAR.
-// Only
-//   pixels that go on past the boundary have a state.
+//     Only pixels that go on past the boundary have a state.
 //   tile_of_state (pairs / PART_PAIRS): the tile of the launch that owns each state.
 #ifdef PART_PAIRS
 #include "shared/count.h"

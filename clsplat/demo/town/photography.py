@@ -144,7 +144,7 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points that a photograph's camera may see. `see` marks those that no solid hides.
+    """Points that a photograph's camera may see. The method `see` marks the points that no solid hides.
 
     blocks: number of the caster's blocks that have points. A block of moving cars comes after them.
     """

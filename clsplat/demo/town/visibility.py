@@ -174,7 +174,7 @@ class _Rays:
         """Cast the rays of a part of the picture against a solid, and keep the hits that are nearest so far.
 
         solid: index of the solid in its block.
-        number: number of the solid among those of all blocks.
+        number: number of the solid, counted over all blocks.
         part: slices of the part's rays, as from `slices`.
         """
         solids = block.solids

@@ -208,7 +208,7 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 
 def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) -> list[Shape]:
-    """Return the shape `first` and then those of `shapes_in_turn`, without the shapes in `failed`.
+    """Return the shape `first`, then the results of `shapes_in_turn`, but no shape in `failed`.
 
     failed: the driver's recorded failures by shape label.
     If the driver has failed in every shape, `first` is tried again, because the cause may be gone.

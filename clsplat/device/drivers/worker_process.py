@@ -34,7 +34,7 @@ _SIGKILL, _SIGTERM = -9, -15
 
 
 class TrialInterrupted(Interrupted):
-    """Raised in a thread that waits for a worker process, if this process is told to end, as by Ctrl-C."""
+    """Raised in a thread that waits for a worker process when this program is told to end, by Ctrl-C or a signal."""
 
 
 class WorkerEndedError(Exception):

@@ -128,7 +128,8 @@ class VisibleChunks(Component):
     ) -> None:
         self._config, self._rasterizer, self._unit, self._next_camera = config, rasterizer, unit, next_camera
         self._borders = lru_cache(_KEPT_BORDERS)(PictureBorders.of)
-        self._ahead: _ShownAhead | None = None
+        self._ahead: dict[tuple[Camera, int, BoundsTable], NDArray[np.uint32]] = {}
+        """Chunks that the next step's view may show, by its camera, the step's number and the bounds."""
         self._limit_movement(largest_step(config.optimiser))
         self._begin(count, 0)
 
@@ -227,12 +228,9 @@ class VisibleChunks(Component):
         if self.step < step - 1:  # earlier steps ran over all rows, as the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
-        ahead, culled = self._ahead, (of_view.camera, step, self._found)
-        numbers = (
-            ahead.numbers
-            if ahead is not None and ahead.is_of(*culled)
-            else self._shown(of_view.camera, step, hidden, most_hidden)
-        )
+        numbers = self._ahead.get((of_view.camera, step, self._found))
+        if numbers is None:
+            numbers = self._shown(of_view.camera, step, hidden, most_hidden)
         if self._before_view is not None:
             self._before_view(len(numbers))
         whole = self._before_view is None and len(numbers) > MAX_SHARE_IN_VIEW * len(self._last)
@@ -251,10 +249,9 @@ class VisibleChunks(Component):
         The bits are the same.
         """
         camera, step = self._next_camera(), self.step + 1
-        self._ahead = None
+        self._ahead.clear()
         if camera is not None and self._count > ORDERED_ROWS and self._since is not None:
-            numbers = self._shown(camera, step, *self._hidden_movement(step))
-            self._ahead = _ShownAhead(camera, step, self._found, numbers)
+            self._ahead[camera, step, self._found] = self._shown(camera, step, *self._hidden_movement(step))
 
     def in_view(self, camera: Camera) -> NDArray[np.uint32]:
         """Numbers of the chunks that a camera may show after the last step."""
@@ -434,24 +431,6 @@ class VisibleChunks(Component):
         """Bytes per Gaussian on the device: the bytes of a chunk's bounds and missed steps, divided by its rows,
         rounded up."""
         return 1 if self.on else 0
-
-
-@dataclass(frozen=True, eq=False)
-class _ShownAhead:
-    """Chunks that the next step's view may show.
-
-    camera, step, bounds: the view's camera, the step's number, and the bounds by which they were found.
-    numbers: (n,) numbers of the chunks, rising.
-    """
-
-    camera: Camera
-    step: int
-    bounds: BoundsTable
-    numbers: NDArray[np.uint32]
-
-    def is_of(self, camera: Camera, step: int, bounds: BoundsTable) -> bool:
-        """True if the chunks were found for this view and step, and no Gaussian has moved since but by Adam."""
-        return self.camera is camera and self.step == step and self.bounds is bounds
 
 
 @dataclass(frozen=True, eq=False)
