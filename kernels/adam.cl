@@ -1,10 +1,11 @@
 // Adam on one parameter group, from gradients in memory. Usually Adam is fused into project_grad.cl. These kernels are
 // for steps that need the gradients in memory, for example to add up the views of a batch.
 //
-// These kernels also set the gradients to zero for the next step, because project_grad writes only the rows of visible
-// Gaussians.
+// adam and adam_visible also set the gradients to zero for the next step, because project_grad writes only the rows of
+// visible Gaussians.
 //
-// Owner: A work-item owns ABREAST consecutive elements (adam), ABREAST rows (adam_visible) or an element (add_view).
+// Owner: A work-item owns ABREAST (shared/adam.h) consecutive elements in adam, ABREAST rows in adam_visible, and one
+//   element in add_view.
 // Launch: One work-item for each ABREAST elements, ABREAST rows or element, in groups of 64; work-items past the end do
 //   nothing.
 // Buffers: A parameter group in its own units, its gradients, its moments `first` and `second`; `readback`

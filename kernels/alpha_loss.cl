@@ -2,13 +2,14 @@
 // |A - alpha| over the pixels that no mask excludes, where A = 1 - T is the render's alpha and `alpha` the
 // photograph's.
 //
-// Owner: A work-item owns a column of TILE rows.
+// Owner: A work-item owns TILE pixels of a column.
 // Launch: A grid of stride x rows / TILE work-items.
-// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels.
+// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels. rows is the
+//     argument `height`, padded to whole tiles.
 //   transmittance, alpha (rows, stride).
 //   scale: the weight divided by the number of pixels that no mask excludes.
 //   -> gradient (rows, stride) with respect to the transmittance, 0 where `stops` is negative; sums (rows / TILE,
-//     stride) of |A - alpha|.
+//     stride) of |A - alpha|, from index first_sum on.
 //   alpha and gradient are the fourth planes of their buffers, after the colours.
 // Equations: docs/gradients.md, (81).
 #include "shared/math.h"

@@ -5,17 +5,19 @@
 //   (move_gains, centre_gains). Every device adds the sums in the same order. Built with one lane.
 // Launch: A grid of stride x sums work-items (column_sums); one work-item for each of the `count` entries (move_gains,
 //   centre_gains).
-// Buffers: logs, start, first, second, moved, gains (photographs, entries): the first three entries are base-2 logs of
-//     gains, the rest are colour mixes (ppisp.cl).
+// Buffers: logs (photographs, entries): the first three entries are base-2 logs of gains, the rest are colour mixes
+//     (ppisp.cl). For vignettes, a row is a lens with three coefficients.
+//   Of the same shape: `start`, the initial logs; `first` and `second`, Adam's moments; `moved`, the logs before
+//     centring; `gains`, 2^logs.
 //   begins (photographs + 1), others, weights: a sparse matrix in CSR form, which pulls gains towards `start`.
-//   partials (sums, tiles_y, stride), columns (sums, stride): partial sums of the gradient. In `columns` the
-//     photograph's entries begin at row `at`.
+//   partials (sums, tiles_y, stride), columns (sums, stride): partial sums of the gradient. The sums of these entries
+//     begin at row `at` of `columns`.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
 
 #define MOST_LOG 16.0f
-#define MOST_MIX 0.2f // limit of a mix: the matrix of six mixes is invertible up to it
+#define MOST_MIX 0.2f // limit of |mix|; below it the matrix of six mixes is invertible
 
 // Adds the partial sums over the rows of tiles: partials -> columns.
 __kernel void column_sums(const int stride, const int tiles_y, __global const float *partials,

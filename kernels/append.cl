@@ -47,8 +47,8 @@ static inline void order_two(Pair *one, Pair *other) {
 // second step compares pairs that are step / 2 apart. An item does both steps for four pairs in registers; these may
 // lie past `count`, up to the next power of two.
 //
-// If `step` is 1, the function still takes two steps, and the first is redundant. It repeats an earlier step, or it is
-// the first step of the sort, before which the pairs may be in any order.
+// If `step` is 1, the two steps compare pairs that are 2 and 1 apart. The first is then redundant: it repeats an
+// earlier step, or it comes before all others, when the pairs may be in any order.
 static inline void order_steps(__local Pair *pairs, uint count, uint step, int mirrored) {
   const uint apart = max(step / 2, 1u), within = apart - 1;
   const uint near = PLACE(apart), far = PLACE(mirrored ? 3 * apart - 1 : 2 * apart), turned = mirrored ? near : 0;
@@ -216,7 +216,7 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
   for (uint k = begin; k < end_of_tiles; ++k) order[atomic_inc(places + clz(ranges[2 * k + 1] - ranges[2 * k]))] = k;
 }
 
-// Appends a pair, made of `slot` and the local variable `depth`, to the list of `tile`. gaussian: its Gaussian's index.
+// Appends the pair of `slot` and the local variable `depth` to the list of `tile`. gaussian: the Gaussian's index.
 #define APPEND(tile, slot, gaussian)                                                                                   \
   {                                                                                                                    \
     pairs[atomic_inc(cursors + (tile))] = (Pair)(slot, depth);                                                         \
@@ -281,8 +281,9 @@ GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tile
 }
 
 // Sorts each tile's list. order and ranges of list_offsets; pairs and gaussian_from_slot (pairs) of append_pairs ->
-// gaussian_from_sorted, slot_from_sorted (pairs). `near` in local memory holds `fit` pairs, a power of two from 16 on.
-// A longer list is sorted in parts of `fit` pairs; then the parts are merged in ever larger blocks, in `pairs`.
+// gaussian_from_sorted, slot_from_sorted (pairs). `near` in local memory has room for `fit` pairs, a power of two and
+// at least 16. A longer list is sorted in parts of `fit` pairs; then the parts are merged in ever larger blocks, in
+// `pairs`.
 GROUP __kernel void sort_lists(const uint fit, __global const uint *order, __global const uint *ranges,
                                __global const uint *gaussian_from_slot, __global Pair *pairs,
                                __global uint *gaussian_from_sorted, __global uint *slot_from_sorted,

@@ -1,9 +1,9 @@
 // The gradient of alpha blending, back to front: sums over a tile's pixels, for each pair of a tile and a Gaussian.
 //
-// Owner: A group owns a tile, with PART_PAIRS a part of its list, and writes a slot for each pair. No two share a slot.
-// Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on; with PART_PAIRS first one for
-//   each state (shared/parts.h). An item owns pixels; with BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend.cl's inputs; blend.cl's outputs, without PART_PAIRS transmittance and stops; slot_from_sorted (pairs).
+// Owner: A group owns a tile, with PART_PAIRS a part of the tile's list. It writes a slot for each pair, and no two
+//   pairs share a slot. An item owns pixels; with BY_GAUSSIAN it owns one Gaussian after another.
+// Launch: As in blend.cl; with PART_PAIRS, groups for the states (shared/parts.h) come before those for the tiles.
+// Buffers: blend.cl's inputs and outputs (image, nearness and states only with PART_PAIRS); slot_from_sorted (pairs).
 //   image_gradient (3, height, width): the loss's gradient with respect to colour. ALPHA_GRADIENT adds a fourth plane,
 //     with respect to the final transmittance. NEARNESS adds a last plane, with respect to nearness.
 //   -> slots (pairs, SLOT_STRIDE): sums over the tile's pixels, in the whitened units of (49); every slot is written.
@@ -59,7 +59,7 @@ typedef struct {
 
 #include "shared/behind.h"
 
-// Undoes the blending of a pair in a cell's pixels. uncapped: its alpha before the cap, 0 in pixels without the pair.
+// Undoes the blending of a pair in a cell. uncapped: the pair's alpha before the cap, 0 in pixels without the pair.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
 #if ITEMS == 1
@@ -93,7 +93,7 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
 
 #include "shared/pair_sums.h"
 
-// Gradient with respect to the final transmittance: `background`, its part through colour, + by_t, the fourth plane.
+// AT_END: the gradient with respect to the final transmittance, the background's part plus by_t, the fourth plane.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4

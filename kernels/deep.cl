@@ -3,7 +3,7 @@
 //
 // Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
-// Buffers: share: 1 / (DEEP_LEVELS * bins).
+// Buffers: share: 1 / (DEEP_LEVELS * bins), the unit of the slack (shared/slices.h) in a pixel of alpha 1.
 //   blend's ranges, gaussian_from_sorted, splats, transmittance and stops; with RAYS camera.
 //   -> planes (bins, DEEP_SIZE, height, width): premultiplied colour, alpha, and the slice's depth in world units. All
 //     values are 0 after a pixel's last slice.
@@ -17,7 +17,8 @@
 #include "shared/prefetch.h"
 #include "shared/slices.h"
 
-// Writes the current slice of each pixel and begins an empty slice, in the lanes that are set in `which`.
+// Writes the current slice of each pixel and begins an empty slice, in the lanes that are set in `which`. values: the
+// sums of the current slices; slices: their numbers.
 static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
                                 size_t stride) {
   IntLanes written;

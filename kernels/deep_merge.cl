@@ -3,7 +3,7 @@
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel.
-// Buffers: share: 1 / (DEEP_LEVELS * bins).
+// Buffers: share: 1 / (DEEP_LEVELS * bins), the unit of the slack (shared/slices.h) in a pixel of alpha 1.
 //   lists (pictures, bins, DEEP_SIZE, pixels): laid out like the planes of deep.cl.
 //   weights (pictures, pixels): their sum over the pictures is 1.
 //   -> sources (pictures * bins, pixels): the picture of each slice, front to back.

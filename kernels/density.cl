@@ -66,9 +66,10 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   largest[row] = largest[row] > contribution ? largest[row] : contribution;
 }
 
-// Computes scores for densification. seen (n): numbers of views -> scores (n): USELESS if no contribution to a view is
-// over contribution_edge; else the mean gradient norm, if it is over gradient_edge; else UNWANTED. A mean that is not
-// finite counts as 0.
+// Computes scores for densification. seen (n): numbers of views; whole_largest, current_largest (n): the largest
+// contribution to a view in the last complete epoch and in the current one -> scores (n): USELESS if neither is over
+// contribution_edge; else the mean gradient norm, if it is over gradient_edge; else UNWANTED. A mean that is not finite
+// counts as 0.
 __kernel void density_scores(const uint n, const float gradient_edge, const float contribution_edge,
                              __global const float *gradient_sums, __global const float *seen,
                              __global const float *whole_largest, __global const float *current_largest,
@@ -82,10 +83,10 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
   scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
 }
 
-// Marks the Gaussians that remain, that are cloned and that are split. Gaussian i is row first + i of the model.
-// scores, radii, logits (n); log_scales (n, 3); cut_off, cut_off_row: a Gaussian may be cloned or split if its score is
-// above cut_off, or if its score equals cut_off and its row is at most cut_off_row -> marks (3, n), 0 or 1: remains, is
-// cloned, is split.
+// Marks the Gaussians that remain, that are cloned and that are split, by the thresholds of MarkRules
+// (clsplat/optimisation/density_rules.py). Gaussian i is row first + i of the model. scores, radii, logits (n);
+// log_scales (n, 3); cut_off, cut_off_row: a Gaussian may be cloned or split if its score is above cut_off, or if its
+// score equals cut_off and its row is at most cut_off_row -> marks (3, n), 0 or 1: remains, is cloned, is split.
 __kernel void density_marks(const uint n, const uint first, const float cut_off, const uint cut_off_row,
                             const float large_edge, const float transparent_edge, const float oversized_edge,
                             const float oversized_half_edge, const float radius_edge, __global const float *scores,

@@ -1,14 +1,15 @@
 // The depth loss and its gradient with respect to the render's nearness N = 1 / depth. The loss is a factor times the
 // sum of weight * |N - aim| over the pixels, where `aim` is the known nearness.
 //
-// Owner: A work-item owns a column of TILE rows.
+// Owner: A work-item owns TILE pixels of a column.
 // Launch: A grid of stride x rows / TILE work-items.
-// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels.
+// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels. rows is the
+//     argument `height`, padded to whole tiles.
 //   nearness (rows, stride): in 1 / world units.
 //   aims (2, rows, stride): target nearness, and weight, which is 0 where the target is unknown.
 //   factor: multiplies the gradient.
 //   -> gradient: plane number `gradient_plane` (rows, stride), 0 where the target is unknown or `stops` is negative;
-//     sums (rows / TILE, stride) of weight * |N - aim|.
+//     sums (rows / TILE, stride) of weight * |N - aim|, from index first_sum on.
 // Equations: docs/gradients.md, (121).
 #include "shared/math.h"
 

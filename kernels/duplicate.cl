@@ -165,8 +165,8 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
   band_counts[i] = count;
 }
 
-// Writes the pairs in order of depth. offsets (visible): exclusive scan of the tile counts in order of rank; slots (n):
-// exclusive scan of the tile counts in order of the Gaussians -> tile_keys (pairs); pair_ids (pairs): slot and
+// Writes the pairs in order of depth. offsets (visible): exclusive scan of the tile counts in order of depth; slots
+// (n): exclusive scan of the tile counts in order of the Gaussians -> tile_keys (pairs); pair_ids (pairs): slot and
 // Gaussian. A Gaussian's slots are consecutive, and slots follow the order of the Gaussians, so that sums over slots
 // stream through memory. Only the band of tiles [first_tile, end_tile) gets pairs; keys count from first_tile.
 __kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y, const int first_tile,

@@ -6,7 +6,8 @@
 //   same order on every device. Built with one lane.
 // Launch: Grids of work-items. slice: stride x rows; slice_gradient: width x height; line_sums: GRID_COLUMNS x height x
 //   3; the others: one work-item for each coefficient.
-// Buffers: image, seen, gradient (3, rows, stride): colour, or the loss's gradient with respect to it.
+// Buffers: image, seen, gradient (3, rows, stride): colour before and after the transform, and the loss's gradient with
+//     respect to colour. across, down: number of grid columns and of grid rows that a pixel spans.
 //   grids, first, second (photographs, GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4).
 //   lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS).
 //   by_grid: the gradient with respect to one photograph's grid.
@@ -118,7 +119,8 @@ __kernel void line_sums(const int width, const int stride, const int plane, cons
 }
 
 // The sum of a coefficient's differences from its two neighbours along an axis of the grid, which are `step` floats
-// away. This is half the gradient of the squared differences.
+// away. This is half the gradient of the squared differences. place: the coefficient's index along the axis, of
+// `count`.
 static inline float pull(__global const float *value, const int place, const int count, const int step) {
   float sum = 0.0f;
   if (place > 0) sum += value[0] - value[-step];

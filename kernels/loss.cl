@@ -10,7 +10,7 @@
 //   items: blocks across x blocks down x channels. Blocks are numbered in this order.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros. With PHOTOGRAPH the target is
 //     (height, width, 3), bytes or floats.
-//   partials: with ITEMS == 1 (groups, LOSS_RING rows, 3 derivatives, field floats); otherwise (3 channels, strips of
+//   partials: with ITEMS == 1 (groups, LOSS_RING rows, 3 derivatives, `field` floats); otherwise (3 channels, strips of
 //     COLUMNS columns, height, 3 derivatives, COLUMNS), so that addresses within a column differ by constants.
 //   -> gradient (3, rows, stride): 0 right of the image.
 //   sums (3, ...), of SSIM, of |image - target| and of its square: one sum per row of a block with ITEMS == 1,
@@ -117,9 +117,9 @@ static inline void moments(const Block block, const int margin, const int y, __l
   }
 }
 
-// Computes SSIM and its derivatives by horizontal sums: near -> partials: the derivatives of SSIM with respect to the
-// image's mean (relative to the centre pixel), to its variance (doubled), and to the covariance, all 0 right of the
-// image. Returns the item's sum of SSIM over the block's own columns.
+// Computes SSIM and its derivatives by horizontal sums of `near`. `partials` gets the derivatives of SSIM with respect
+// to the image's mean (relative to the centre pixel), to its variance (doubled), and to the covariance, all 0 right of
+// the image. Returns the item's sum of SSIM over the block's own columns.
 static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
   FOR_VECTORS(block, margin, 1) {
@@ -127,7 +127,7 @@ static inline float derivatives(const Block block, const int margin, const int y
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
-    // off1, off2: the means minus p and q.
+    // off1, off2: the windows' means of image and target, minus the centre pixels p and q.
     floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1;
     for (int tap = 0; tap < TAPS; ++tap) {
       __local const float *in = near_at + (tap - REACH);

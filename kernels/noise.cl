@@ -5,8 +5,8 @@
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n).
 //   first_row: the first Gaussian's row in the model. key0, key1: the step's random key.
-//   amount: in 1 / world units. dead: opacity at which half of the noise is added. highest: Gaussians with this logit
-//     or more do not move.
+//   amount: a factor of the noise, in 1 / world units. dead: opacity at which half of the noise is added. highest:
+//     Gaussians with this logit or more do not move.
 //   readback (READBACK_SIZE): after a stopped pass (duplicate.cl) nothing changes.
 //   -> means (n, 3): in world units.
 // Equations: docs/gradients.md, (92) and (93).

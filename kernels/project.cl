@@ -1,7 +1,7 @@
 // Projection for perspective and orthographic cameras: each Gaussian's ellipse, colour, depth and number of tiles.
 //
 // Owner: A work-item owns LANES Gaussians. It projects in vectors, and computes tiles and colours one visible Gaussian
-//   at a time. How far a Gaussian reaches (its radius): shared/tile.h, by RasterizerConfig.extent.
+//   at a time. RasterizerConfig.extent sets how far a Gaussian reaches (shared/tile.h).
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
 // Buffers: means (n, 3): in world units. quaternions (n, 4): w x y z. log_scales (n, 3). opacity_logits (n). sh_dc (n,
 //     3). sh_rest (n, coefficients - 1, 3).

@@ -13,7 +13,8 @@
 //   by_lens (n, 4), with LENS: each Gaussian's gradient with respect to the logs of the focal lengths and, per pixel,
 //     to the principal point.
 //   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians.
-//   PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
+//   PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2), with the opacity o and the scales
+//     s_k.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"

@@ -7,8 +7,8 @@
 // Buffers: radii (n, 2): in whole pixels; a radius of 0 culls. means2d (n, 2): in pixels.
 //   conics (n, 3): a, b, c of the inverse covariance. opacities (n): in [0, 1]. depths (n).
 //   values (n, width): the first three are the colour, with 0 in place of missing values.
-//   -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With LISTED the caller makes the
-//     tile lists, so every splat is written; a culled Gaussian's splat has alpha 0.
+//   -> splat_rows (n, SPLAT_SIZE): the splats, written where visible; tile_counts (n): 0 where culled. With LISTED the
+//     caller makes the tile lists, so every splat is written; a culled Gaussian's splat has alpha 0.
 // Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -7,10 +7,10 @@
 // Buffers: gradient_by_cell reads d_pixels (height, width, depth), background (depth), and with ALPHA_GRADIENT d_alpha
 //     (height, width). -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell, the gradients with respect to all
 //     values, then with respect to the final transmittance (background included); 0 in padding.
-//   values_grad reads blend_grad's lists and planes, value_rows (n, depth) and by_cell. -> slots (pairs, FIELDS), all
-//     written: sums over the tile's pixels of the gradients with respect to VALUES values, from `first` on. With
-//     GEOMETRY, g and its moments, computed from all values, come before these sums. With ABSOLUTE_GRADIENTS, absolute
-//     gradients with respect to the mean come last.
+//   values_grad reads ranges, gaussian_from_sorted, slot_from_sorted, splats, transmittance and stops as blend_grad.cl
+//     does, value_rows (n, depth) and by_cell. -> slots (pairs, FIELDS), all written: sums over the tile's pixels of
+//     the gradients with respect to VALUES values, from `first` on. With GEOMETRY, g and its moments, computed from all
+//     values, come before these sums. With ABSOLUTE_GRADIENTS, absolute gradients with respect to the mean come last.
 // Equations: docs/gradients.md, (178) to (180), with (22) to (26), (48) and (49).
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -35,8 +35,8 @@
 #define FIELDS ABSOLUTE
 #endif
 
-// BY_TILE: number of floats per tile in by_cell. IN_CELL: the index in a tile's part of by_cell of value k of a cell.
-// The values of neighbouring lanes or items are adjacent.
+// BY_TILE: number of floats per tile in by_cell. IN_CELL: the index of value k of a cell, within the tile's part of
+// by_cell. The values of neighbouring lanes or items are adjacent.
 #define BY_TILE ((size_t)(depth + 1) * (TILE * TILE))
 #if ITEMS == 1
 #define IN_CELL(cell, k) (((cell) * (depth + 1) + (k)) * LANES)
@@ -90,7 +90,7 @@ static inline floatL shade_of(__global const float *by_pixels, int depth, int ce
 }
 
 // Undoes the blending of the i-th pair in the pixels of a cell, and adds the pixels' gradients to the pair's sums
-// (FIELDS).
+// (FIELDS). by_pixels: the tile's part of by_cell; own: the Gaussian's values.
 static inline void take_pair(Pixels *p, int i, floatL u, floatL v, float l11, float l12, float l22, float log2o,
                              __global const float *by_pixels, int depth, int first, int cell, __global const float *own,
                              floatL *sums) {

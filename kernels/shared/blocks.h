@@ -114,8 +114,8 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
 #endif
 
 // BATCH: number of splats that the group's items fetch together into local memory, where all items read them. Every
-// item fetches the same number of splats, at the list's end the last splat again: a compiler that vectorises across
-// items may read memory for idle items too.
+// item fetches the same number of splats, and at the list's end the last splat again. The reason: a compiler that
+// vectorises across items may read memory for idle items too.
 #ifndef BATCH
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
 #endif
@@ -186,8 +186,8 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
 }
 
 // An entry of a list: the pair's number in its batch, with the bit DENSE if the pair reaches more than half of the
-// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE, the largest
-// number of reached blocks without DENSE, minus the number of reached blocks.
+// set's blocks. It is then quicker to process all of the item's cells without a branch. SPARSE: the largest number of
+// reached blocks without DENSE; spare: SPARSE minus the number of reached blocks.
 #define DENSE 0x80000000u
 #define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))

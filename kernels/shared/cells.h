@@ -57,8 +57,8 @@ typedef int4 int4U __attribute__((aligned(4)));
 #endif
 #endif
 
-// Reach: the set of cells that a Gaussian reaches. If a tile has at most 32 cells, it has a bit for each cell with a
-// pixel in the ellipse. Otherwise it is the range of cells that the ellipse's box reaches.
+// Reach: the set of cells that a Gaussian reaches. For tiles of at most 32 cells, Reach has a bit for each cell, set if
+// the cell has a pixel in the ellipse. Otherwise Reach is the range of cells that the ellipse's box reaches.
 #if LANES >= 8
 #ifndef RAYS // with RAYS every cell of a tile is visited
 #define CELLS_BY_ELLIPSE

@@ -1,9 +1,9 @@
 // Maps the rows of a launch that covers only some chunks of a model to rows of the model. With CHUNKS, a kernel has the
-// parameters CHUNK_PARAMETERS at its end. `chunks` (n / CHUNK_ROWS): the model's chunk for each CHUNK_ROWS rows of the
-// launch, then NO_CHUNK; `model_rows`: the number of rows of the model. The chunks of a streamed model lie in the slots
-// of a pool, in any order; `chunks` then lists slots, and `model_rows` is the number of rows of all slots. With
-// FIRST_ROWS, a kernel over slots has the parameter `first_rows` (n / CHUNK_ROWS): the number that the first row of
-// each chunk has in the whole model.
+// parameters CHUNK_PARAMETERS at its end. `chunks` (n / CHUNK_ROWS): for each CHUNK_ROWS rows of the launch the number
+// of the model's chunk, or NO_CHUNK as padding at the end; `model_rows`: the number of rows of the model. The chunks of
+// a streamed model lie in the slots of a pool, in any order; `chunks` then lists slots, and `model_rows` is the number
+// of rows of all slots. With FIRST_ROWS, a kernel over slots has the parameter `first_rows` (n / CHUNK_ROWS): the
+// number that the first row of each chunk has in the whole model.
 //
 // Arrays of a view, such as splats and tile_counts, have the rows of the launch. Parameters, moments and statistics
 // have the rows of the model.

@@ -1,10 +1,11 @@
 // The kernels of a colour model (exposure.cl, ppisp.cl). They remove a photograph's own colours pixel by pixel, and
 // compute the gradient with respect to the model's entries. appearance.cl updates the entries. A colour model's file
 // defines, before it includes this header:
-//   ENTRIES, LENS_ENTRIES: numbers of entries of a photograph, of which the first three are gains, and of a lens.
+//   ENTRIES: number of entries of a photograph, of which the first three are gains. LENS_ENTRIES: number of entries of
+//     a lens.
 //   developed: removes a photograph's own colours from LANES pixels, in place.
-//   add_terms: adds the terms of LANES pixels to the gradient's ENTRIES + LENS_ENTRIES sums. Sums of gains and lenses
-//     are divided by ln 2.
+//   add_terms: adds the terms of LANES pixels to the gradient's ENTRIES + LENS_ENTRIES sums. The sums for gains and for
+//     lenses leave out a factor ln 2, which appearance.cl applies.
 // The argument s of both functions is the squared distance of the pixels from the principal point, in squared half
 // diagonals; 0 for panoramas.
 //

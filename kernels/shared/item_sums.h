@@ -1,5 +1,5 @@
-// Sums over ADDENDS items, those of a group or of a warp, by a binary tree: first two neighbours, then two pairs, two
-// fours and so on. The order and the bits are the same whether items leave their addends in local memory or exchange
+// Sums over ADDENDS items, those of a group or of a warp, by a binary tree: sums of two neighbours, then of four, of
+// eight and so on. The order and the bits are the same whether items leave their addends in local memory or exchange
 // them in sub-groups of SUBGROUP items. ADDEND: the item's number among the ADDENDS items.
 #ifndef ADDENDS
 #define ADDENDS ITEMS

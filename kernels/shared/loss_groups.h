@@ -138,9 +138,9 @@ static inline float reciprocal(const float x) {
   return fma1(c, fma1(-x, c, 1.0f), c);
 }
 
-// Computes SSIM and its derivatives by horizontal sums: near -> partials: the derivatives of SSIM with respect to the
-// image's mean (relative to the cell's middle pixel), to its variance (doubled), and to the covariance; parts: each
-// part's sum of SSIM.
+// Computes SSIM and its derivatives by horizontal sums of `near`. `partials` gets the derivatives of SSIM with respect
+// to the image's mean (relative to the cell's middle pixel), to its variance (doubled), and to the covariance. `parts`
+// gets each part's sum of SSIM.
 static INLINE void derivatives(const Block block, __local const float *near, __local float *parts) {
   FOR_PARTS(part, PARTS) {
     parts[part] = 0.0f;

@@ -2,7 +2,8 @@
 // docs/gradients.md.
 #ifdef RAYS
 // Adds a pixel to the sums along rays: SLOT_GU and SLOT_GV get the gradient with respect to the mean on its tangent
-// plane. It is not linear in (u, v), because the plane turns with the mean: equation (21) of docs/cameras.md.
+// plane. This gradient is not linear in (u, v), because the plane turns with the mean: equation (21) of
+// docs/cameras.md.
 static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
   const floatL q = fmaL(u, u, v * v);
   const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;

@@ -17,8 +17,8 @@
 #define STATE_GREEN 2
 #define STATE_BLUE 3
 #define STATE_NEAR 4 // sum of weight / depth
-// The address of a field of a state for a cell's pixel. Pixels are in blocks of 4 x 8, the blocks of a group of 32
-// items or more, in groups of any size.
+// The address of a field of a state for a cell's pixel. In groups of any size, a state's pixels are stored in blocks of
+// 4 x 8, which are the blocks of groups of 32 items or more (blocks.h).
 #define PIXEL_IN_STATE(cell)                                                                                           \
   ((CELL_Y(cell) / 8 * (TILE / BLOCK_W) + CELL_X(cell) / BLOCK_W) * (8 * BLOCK_W) + CELL_Y(cell) % 8 * BLOCK_W +       \
    CELL_X(cell) % BLOCK_W)
@@ -26,9 +26,9 @@
   states[((size_t)(state) * STATE_SIZE + (field)) * (TILE * TILE) + PIXEL_IN_STATE(cell)]
 #define FIRST_STATE(begin) ((begin) / PART_PAIRS)
 
-// Defines the group's tile like TILE_OF_GROUP, and for [begin, end) the group's part of the list. Group number `state`
-// below `most_states` has the part before the boundary of this state, and ends the kernel if there is no such boundary.
-// Further groups, one for each tile, have the rest of a list behind its last boundary.
+// Defines the same as TILE_OF_GROUP, except that [begin, end) is only the group's part of the list. Group number
+// `state` below `most_states` has the part before the boundary of this state, and ends the kernel if there is no such
+// boundary. Further groups, one for each tile, have the part of the tile's list behind its last boundary.
 #define PART_OF_GROUP                                                                                                  \
   const int state = get_group_id(0), within = state < most_states;                                                     \
   if (within && state >= FIRST_STATE((int)pairs)) return;                                                              \

@@ -1,7 +1,8 @@
 // Sums over a tile's pixels for blend_grad.cl, in a group of several work-items. From 32 items on, the order of
 // addition does not depend on the number of items. A strip is a row of blocks (blocks.h); with 32 items or more it is
-// half of the tile. Each of the 32 lanes of a strip adds its pixels from left to right, and applies v, which is the
-// same for all of them. A tree then adds the lanes, and the strips are added from top to bottom.
+// half of the tile. Each of the 32 lanes of a strip adds its pixels from left to right, then multiplies by the whitened
+// coordinate v, which is the same for all of them. A tree then adds the lanes, and the strips are added from top to
+// bottom.
 //
 // A team of items owns one strip, or several strips one after the other, and processes TOGETHER of the strip's pairs at
 // a time. The items of the team leave their sums in rows of local memory, one row for each field. Then each item adds
@@ -97,10 +98,9 @@ static inline void leave_pixel(Share share, float u, float v, __local float *blo
 #endif
 }
 
-// Adds up a pair's gradients in the lane's pixel of each block, from the values that LEAVE_PIXEL has stored, and stores
-// the sums in local memory in the first SLOT_STRIDE rows of the pair (PAIR_ROWS), one for each field, over the values
-// that LEAVE_PIXEL stored there. blocks: the set of blocks that the pair reaches; strip: the image's gradient in the
-// lane's pixel of each block.
+// Adds up a pair's gradients in the lane's pixel of each block, from the values that LEAVE_PIXEL has stored. The sums
+// overwrite these values in local memory: each of the pair's first SLOT_STRIDE rows gets one field. blocks: the set of
+// blocks that the pair reaches; strip: the image's gradient in the lane's pixel of each block.
 static inline void join_blocks(uint blocks, const Pixels *strip, float v, float l11, float l12, float l22,
                                __local float *pair_rows) {
   float sums[SLOT_STRIDE];

@@ -16,8 +16,8 @@ static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 #ifdef NEEDS_TANGENTS
 // The tangent plane at a direction, for images whose radius depends only on the angle from the axis: fills *t by
 // equations (9), (10), (19) and (30) of docs/cameras.md. f: the unit direction; across: the distance of f from the
-// axis; along / slope, a quotient of two arguments: the angle in radians that fx pixels cover away from the axis;
-// around: the angle that they cover around the axis.
+// axis; along / slope: the angle in radians that fx pixels cover in the direction away from the axis; around: the angle
+// that fx pixels cover around the axis.
 static inline void tangent_around_axis(const float *f, float across, float along, float slope, float around,
                                        __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];

@@ -7,7 +7,8 @@
 #define ratio_rest slope_rest
 
 #ifdef NEEDS_PROJECTION
-// The low part of the Jacobian's clamped x/z. Where x/z is clamped, this is the low part of the limit.
+// The low part of the Jacobian's clamped x/z. Where x/z is clamped, this is the low part of the limit. ratio: the
+// clamped x/z; low, high: the limits, with the low parts low_rest and high_rest.
 static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
                                   float low_rest, float high, float high_rest) {
   const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
