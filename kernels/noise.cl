@@ -20,7 +20,8 @@
 #define SPREAD 1.86881232e-5f // 1 / sqrt(HALVES * (2^32 - 1) / 12), the inverse of the sum's standard deviation
 
 // The normally distributed random number with the given index, 0 to 2, for a row of the model: equation (93) of
-// docs/gradients.md. It is a scaled sum of uniform integers. The sum stays below 2^23, so only the scaling rounds.
+// docs/gradients.md. row_word: a random word of the row and the step. The number is a scaled sum of uniform integers.
+// The sum stays below 2^23, so only the scaling rounds.
 static inline float normal(uint row_word, uint index) {
   int sum = -(HALVES * 65535) / 2;
   for (uint k = 0; k < WORDS; ++k) {

@@ -27,7 +27,8 @@ def kernel_defines(
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
-        # No skips: rows and columns are skipped by whole cells, so that the image would depend on the kernel shape.
+        # No skips: a Gaussian may be visible beyond 3 sigma. Skips of whole rows and columns of cells would cut it off
+        # at a place that depends on the kernel shape.
         defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))

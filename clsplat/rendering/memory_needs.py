@@ -86,6 +86,7 @@ def plan_step(
 ) -> Plan:
     """Plan the device memory for a training step with any of the cameras. Raises CapacityError.
 
+    coefficients: number of SH coefficients per colour channel.
     models: number of arrays per parameter. The default is the number for a step of one view.
     """
     planes, extra = 0, step.masks * (target.MASK_PIXEL_BYTES + loss_terms.ALPHA_PIXEL_BYTES + step.turns)
@@ -118,12 +119,12 @@ def plan_step(
     return _plan(device, need)
 
 
-def plan_view(device: Device, made: Plan, in_view: int) -> Plan:
+def plan_view(device: Device, previous: Plan, in_view: int) -> Plan:
     """Plan steps over the chunks in view again, with memory for views of up to `in_view` rows. Raises CapacityError.
 
-    made: the previous plan of these steps.
+    previous: the last plan of these steps.
     """
-    return plan_by_chunk(replace(made.need, in_view=in_view), made.allowed, device.max_allocation)
+    return plan_by_chunk(replace(previous.need, in_view=in_view), previous.allowed, device.max_allocation)
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:

@@ -137,6 +137,8 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
     A frame with more pairs than `Plan.pairs` is divided by `stages.duplicate.plan_bands`.
 
+    budget: memory limit, bytes.
+    max_allocation: largest size of an array, bytes.
     alignment: number of which `Plan.rows` must be a multiple if parameters are streamed.
     Raises CapacityError if not even the smallest pieces fit.
     """
@@ -186,6 +188,8 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
 
     The arrays with a row for each Gaussian in view have memory for as many rows as the pool, or for `need.in_view` rows
     if these are more.
+
+    budget, max_allocation: as for `plan`.
     """
     assert need.held is not None, "steps over the chunks in view"
     room = budget - need.planes - need.scratch - need.gaussians * need.held - CHUNK_ROWS * need.record

@@ -98,8 +98,11 @@ class ForwardPass:
     blended: Blended
     refused: tuple[int, ...] = ()
 
-    def by(self, camera: Camera, camera_array: DeviceArray) -> ForwardPass:
-        """A copy of this pass, with the same arrays, for another camera of the same model and size."""
+    def for_camera(self, camera: Camera, camera_array: DeviceArray) -> ForwardPass:
+        """A copy of this pass, with the same arrays, for another camera of the same model and size.
+
+        camera_array: the packed camera on the device.
+        """
         lists = (self.projected, self.bands, self.listed, self.blended)
         return self if camera is self.camera else ForwardPass(camera, camera_array, self.background, *lists)
 
@@ -216,8 +219,8 @@ class Rasterizer:
 
         background: (3,) float32, on the host or the device; or the two arrays that `send` or `keep` returned.
         backward: True if a gradient will follow.
-        room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
-        no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
+        room: capacity with which to run without waiting for the number of pairs. A pass with more pairs has no effect
+        (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: also blend 1 / depth (see `blend`).
         chunks: the only chunks of the model that may be in view. None means all, or those that the pool of a streamed
@@ -266,8 +269,9 @@ class Rasterizer:
     ) -> tuple[AnyGaussians, ChunkList | ChunkNumbers | None]:
         """Find the chunks of a streamed model that the camera may show. Returns the model and the chunks to project.
 
-        They are the pool's rows and the chunks' slots if the pool has slots for these chunks; otherwise the whole model
-        and the chunks' numbers. Without culling (`pool.cull` is None) they are the whole model and None.
+        If the pool has slots for all these chunks, the model is the pool's rows, and the chunks are given by slot.
+        Otherwise it is the whole model, and the chunks are given by number. Without culling (`pool.cull` is None) it is
+        the whole model, and the chunks are None.
         """
         if pool.cull is None:
             return gaussians, None
@@ -289,7 +293,10 @@ class Rasterizer:
         return row
 
     def listed(self, frame: ForwardPass, band: Band) -> ListedBand:
-        """Return a band of the frame with its pairs and lists. Of several bands, each reuses the last one's memory."""
+        """Return a band of the frame with its pairs and lists.
+
+        If there are several bands, each reuses the memory of the band before.
+        """
         if len(frame.bands) == 1:
             return frame.listed
         return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
@@ -327,7 +334,7 @@ class Rasterizer:
 
     def shares(self, frame: ForwardPass, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
         """Blend any values of the Gaussians. Returns planes (floats + 2, height, stride): the weighted means of the
-        values, and two planes of depths.
+        values, then median depth and first depth.
 
         rows: (n, floats), the values of each Gaussian.
         held: the holdout, as for `hold_out`.
@@ -347,7 +354,7 @@ class Rasterizer:
         return self.by_band(frame, lambda listed: deep(device, self.work, bins, listed.lists, *pixels))[-1]
 
     def device_of(self, camera: Camera) -> Device:
-        """The device with the kernel switches of the camera's projection."""
+        """The device with the kernel defines of the camera model."""
         return self._by_model[camera.model]
 
     def _list(

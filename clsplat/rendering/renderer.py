@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The renderer that callers use: it renders a model and a camera to image, alpha and channels on the host."""
+"""The renderer that callers use: it renders a model, and returns image, alpha and channels on the host."""
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ class Renderer:
         return shares
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-        """Render the view in slices by depth, (bins, H, W, 5), front to back in each pixel.
+        """Render the view in at most `bins` slices by depth in each pixel: (bins, H, W, 5), front to back.
 
         The last axis is red, green, blue (premultiplied), alpha, and the slice's depth. All are 0 behind a pixel's last
         slice. The result is a view of planes.
@@ -309,8 +309,8 @@ class Renderer:
         *,
         moved: int = 0,
     ) -> tuple[AnyGaussians, Camera]:
-        """The model on the device, or on the host if a frame of this size leaves too little memory; and the camera
-        relative to the model's origin.
+        """The model on the device, or on the host if the device has no room for it and a frame of this size; and the
+        camera relative to the model's origin.
 
         features: floats of each Gaussian that are blended to extra channels.
         planes: bytes per pixel in addition to the picture's.

@@ -56,8 +56,9 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
     """Return the number of coefficients per channel up to the highest needed degree; and True if each Gaussian should
-    store only its own degree. This is so if it leaves out more than MIN_DROPPED_SH_FRACTION of the coefficients above
-    band 0.
+    store only the bands up to its own degree.
+
+    The flag is True if more than MIN_DROPPED_SH_FRACTION of the coefficients above band 0 are then left out.
 
     degrees: (n,), the degree that each Gaussian needs.
     """

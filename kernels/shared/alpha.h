@@ -1,5 +1,5 @@
 // A Gaussian's alpha in a tile's pixels. blend.cl and blend_grad.cl must compute the same bits, because the gradient
-// recovers the image's transmittance by division. The limits ALPHA_MIN and ALPHA_MAX: math.h.
+// recovers the image's transmittance by division. The limits ALPHA_MIN and ALPHA_MAX are in math.h.
 
 // A Gaussian's nearness, 1 / depth, is blended like a colour (equation (120) of docs/gradients.md).
 #ifdef NEARNESS

@@ -34,8 +34,8 @@ static inline int end_cell(float high, float size, int count) {
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
-// The largest box, in tiles, of which all tiles are listed. For so few tiles, a test of which tiles the ellipse reaches
-// would take longer than blend.cl takes to find that no pixel of a tile is reached.
+// A box of up to SMALL_BOX tiles is listed whole. For so few tiles, a test of which tiles the ellipse reaches would
+// take longer than the surplus tiles take in blend.cl.
 #ifdef BOX_TILE_TEST // RasterizerConfig.tile_test
 #define SMALL_BOX 0x7fffffff
 #elif !defined(SMALL_BOX)

@@ -137,7 +137,7 @@ class GradientStep:
             numbers, given = thinning_numbers(self.thinning), (source, sent[0])
             frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
             self.device.under_way.append(source.buffer)  # keeps the photograph's array until the device has read it
-            frame = frame.by(camera, sent[0])
+            frame = frame.for_camera(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
             probe.pair_gradients(slots)
