@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the colour models: photographs without their own colours, the gradient, and the update by Adam."""
+"""Cases of the colour models: removal of a photograph's own colours, the gradient, and the update by Adam."""
 
 from __future__ import annotations
 
