@@ -279,7 +279,7 @@ def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
 
 
 def _sh_bits(text: str | None) -> tuple[int, int] | None:
-    """Parse "6" or "5,4". Returns the bits of band 1 and of the higher bands. Raises InputError."""
+    """Parse "6" or "5,4" to the bits of band 1 and of the higher bands. None stays None. Raises InputError."""
     if text is None:
         return None
     words = [word.strip() for word in text.split(",")]
