@@ -193,7 +193,7 @@ class DeviceArray:
         return DeviceArray(self.device, buffer, (stop - start, *self.shape[1:]), self.dtype)
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """Return an array of this shape in the same memory. It must not have more elements than this array."""
+        """Return an array of the given shape in the same memory, with at most as many elements as this array."""
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 

@@ -176,7 +176,7 @@ class Device:
 
     @property
     def is_another(self) -> bool:
-        """True if the driver failed in the preferred kernel shape, so that the device uses another one."""
+        """True if the driver failed in the preferred kernel shape, so that the device uses another shape."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
@@ -238,8 +238,9 @@ class Device:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
-        """Run `work`. Return its result and a command buffer of the commands that it put on the queue, or None instead
-        of the command buffer if a replay of them is not possible.
+        """Run `work`. Return its result, and a command buffer of the commands that it put on the queue.
+
+        The second result is None if these commands cannot be replayed.
 
         given: buffers that a replay may replace by other buffers (`CommandBuffer`).
         """

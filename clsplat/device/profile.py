@@ -140,9 +140,9 @@ their bytes count twice."""
 
 
 def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
-    """Mark a function as a stage of the pipeline; its first argument is the device.
+    """Mark a function, whose first argument is the device, as a stage of the pipeline.
 
-    updated: for kernels that the function launches, by name, the number of arrays that they both read and write.
+    updated: for kernels that the function launches, by name: the number of arrays that the kernel reads and writes.
     """
 
     def decorate(function: Callable[Concatenate[D, P], R]) -> Callable[Concatenate[D, P], R]:

@@ -162,7 +162,7 @@ def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool
 
 
 def _check_pair(task: Task, left: Camera, right: Camera) -> None:
-    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio: its parts share these."""
+    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio, which its parts share."""
     values = {"size": [f"{frame.width}x{frame.height}" for frame in (left.window or left, right.window or right)]}
     if task.optics is not None:
         # compare as float32, the precision in which EXR headers store the pixel aspect ratio

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of `clsplat render`: the shot that its flags ask for, one for each eye with --stereo, and the settings taken
-from a USD stage."""
+"""Cameras of `clsplat render`: the shot that its flags ask for, or with --stereo a shot for each eye, and the settings
+taken from a USD stage."""
 
 from __future__ import annotations
 

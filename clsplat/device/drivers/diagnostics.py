@@ -109,7 +109,7 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
 
 
 def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Diagnostic]:
-    """Return a finding for each device; or one finding with advice if there is no device or they were not listed.
+    """Return a finding for each device. If there is none or they could not be listed, return one finding with advice.
 
     devices, trouble: the results of `listed_devices`.
     """

@@ -75,7 +75,7 @@ def kind_of(device: cl.Device) -> str:
 
 
 def title(device: cl.Device) -> str:
-    """Return the names of a device and its driver, without PoCL's build options, which follow two spaces."""
+    """Return the names of a device and its driver, without the build options that PoCL adds after two spaces."""
     return f"{device.name.strip()}, {device.platform.version.split('  ')[0].strip()}"
 
 

@@ -205,8 +205,8 @@ SPLATS_CASE = Case(
 
 
 def of_values(bench: CaseBench) -> StageOutcome:
-    """Test the blending of VALUES_PER_GAUSSIAN values per Gaussian with the weights of the scene's image, and its
-    gradient."""
+    """Test the blending of VALUES_PER_GAUSSIAN values per Gaussian, with the weights of the scene's image, and the
+    gradient of this blending."""
     device, camera, n = bench.device, bench.camera, bench.model.count
     size = (camera.height, camera.width)
     given, behind = evenly(91, (n, VALUES_PER_GAUSSIAN), -1.0, 1.0), evenly(92, (VALUES_PER_GAUSSIAN,), 0.0, 1.0)
