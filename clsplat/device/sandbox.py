@@ -181,7 +181,7 @@ class KernelTrials:
             self._failed[name] = str(error)  # the error is kept, so that this process does not repeat the trial
             raise error
         self.known[name] = str(answer.get("salt", ""))
-        if "salt" in answer:  # no salt means that the compiler has refused the text, as it will in this process
+        if "salt" in answer:  # without a salt, the compiler has refused the text, and this process will report that
             driver_records.remember(self._device, self._shape, kernels={name: self.known[name]})
 
     def fail(

@@ -233,7 +233,7 @@ def _random_noise(rng: Generator, count: int) -> Inputs:
     """Random Gaussians of nearly any opacity and shape, including needles and discs."""
     explore = Exploration(amount=10 ** rng.uniform(-3, 3), key=step_key(0, int(rng.integers(1 << 30))))
     logits = rng.uniform(-9, 0, count).astype(np.float32)
-    logits[0] = -7.0  # so faint that at least one Gaussian moves
+    logits[0] = -7.0  # the first Gaussian is so faint that the noise moves it
     return Inputs(
         explore=explore,
         quaternions=(rng.standard_normal((count, 4)) * 10 ** rng.uniform(-3, 3, (count, 1))).astype(np.float32),
