@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 
 LABEL_GAP_PX = 9.0
-"""Minimum distance in pixels between a point and its label."""
+"""Radius in pixels of the innermost ring of candidate boxes around a point."""
 RING_SPACING_PX = 8.0
-"""Distance in pixels between rings of candidate boxes."""
+"""Difference in pixels between the radii of two consecutive rings."""
 RING_COUNT, DIRECTIONS_PER_RING = 50, 24
 """Number of rings of candidate boxes around a point, and of boxes in a ring."""
 MARKER_RADIUS_PX = 6.0
@@ -47,7 +47,8 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
     lines: segments that labels and leader lines should not cross.
     A point's marker covers a square around the point.
     The search is greedy and starts with the points that have the most neighbours.
-    Each label gets the candidate box with the smallest covered area; among equal areas, the lowest cost decides.
+    Each label gets the candidate box with the smallest penalty. Penalties are for covered labels, markers and leader
+    lines, and for the area outside the frame. Among equal penalties the lowest cost decides.
     Costs are for the distance, for crossings, and for other points near the label.
     """
     markers = np.hstack([points - MARKER_RADIUS_PX, points + MARKER_RADIUS_PX])
@@ -79,7 +80,7 @@ def _candidates(point: Float64, size: Float64) -> Float64:
     """Return the candidate boxes (RING_COUNT * DIRECTIONS_PER_RING, 4) for a label near a point, nearest ring first.
 
     point: (2,), and size: (2,), the label's width and height, in pixels.
-    Each box lies outside its ring and touches it, in one of DIRECTIONS_PER_RING directions.
+    A ring is a circle around the point. Its boxes extend outwards from DIRECTIONS_PER_RING positions on the circle.
     """
     angles = 2 * pi * np.arange(DIRECTIONS_PER_RING) / DIRECTIONS_PER_RING
     directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 9)

@@ -75,7 +75,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Draw a bar chart of the gain by each exact switch: time without it, divided by time with all exact switches."""
+    """Draw a bar chart of each exact switch's gain: time without the switch, divided by time with all of them."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:

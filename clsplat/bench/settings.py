@@ -35,7 +35,7 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Name of the setting with all exact switches off. Of several values, a switch takes the one that skips least work."""
+"""Name of the setting with all exact switches off. Switches with several values take the one that skips least work."""
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
@@ -103,6 +103,7 @@ def compare(
     """Measure run time and error of each setting.
 
     candidates: the settings by name; None measures `settings()`. repeat: number of rounds.
+    progress: function that is called with a text and the completed fraction; None for no calls.
     Times are medians for a frame and for a training step. Each round measures all settings in turn.
     Errors are relative to the float64 reference in a crop, and to the frame of the exact preset in the full image.
     If the settings include exact and ALL_EXACT_SWITCHES_OFF, the result also has the ratio of their times.
@@ -202,6 +203,7 @@ def _points(
 ) -> dict[str, dict[str, Any]]:
     """Return a record for each setting: median times, errors, and `on_front`, True on the Pareto front.
 
+    tried: the settings by name.
     times: milliseconds of a frame and of a step, in each round.
     differences: results of `error_of` for each setting and reference.
     against: reference whose difference is used as the setting's error, a key of the differences.
@@ -224,9 +226,10 @@ def _points(
 
 
 def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str | None) -> dict[str, float] | None:
-    """Return time with all exact switches off / time with all on, of frame and step; None unless both were measured.
+    """Return how many times faster a frame and a step are with all exact switches on than with all off.
 
-    exact: name of the exact preset among the points.
+    The result is None if one of these two settings was not measured.
+    exact: name of the exact preset among the points; None if it was not measured.
     """
     if exact is None or ALL_EXACT_SWITCHES_OFF not in points:
         return None

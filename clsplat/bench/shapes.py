@@ -37,7 +37,7 @@ from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 TRIAL_WORKLOAD = (50_000, 640, 480)
 """Number of Gaussians, and width and height of the frame in pixels, in a trial of a shape."""
 REPLACEMENT_TIME_RATIO = 0.97
-"""A shape replaces the default if the ratio of their times is at most this. Smaller gains may be noise."""
+"""A shape replaces the default if its time, divided by the default's, is at most this. Smaller gains may be noise."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,10 @@ class Trial:
 
 
 def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tuple[list[Trial], Shape]:
-    """Try the candidate shapes on a device and save the fastest. Returns all trials, and the fastest shape.
+    """Try the candidate shapes on a device and save the result of `choose`. Returns all trials, and this result.
 
     index: the device's index among all devices.
+    progress: function that is called with each shape before its trial.
     Raises DriverError if no candidate works, and OSError if the shape cannot be saved.
     """
     trials = []
@@ -97,6 +98,7 @@ def measure(device: Device, workload: tuple[int, int, int] = TRIAL_WORKLOAD, rep
     """Measure the median milliseconds of a frame and its gradient, for a synthetic scene.
 
     workload: number of Gaussians, and width and height of the frame in pixels.
+    repeat: number of measurements.
     """
     subject = synthetic(*workload)
     rasterizer = Rasterizer(device)

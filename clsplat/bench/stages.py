@@ -51,6 +51,11 @@ def bench(
     """Measure every stage of a frame and of a training step. Returns the object that `clsplat bench --json` prints.
 
     The device's queue should have been created with profiling, as kernels' times come from its events.
+
+    config: settings of the rasterizer; None for the defaults.
+    repeat: number of rounds in which the frame and the step are measured. Times are medians.
+    limits: the device's measured limits; None measures them.
+    progress: function that is called with a text and the completed fraction; None for no calls.
     """
     say = progress or no_progress
     config = (config or RasterizerConfig()).switches()
@@ -132,7 +137,10 @@ def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int)
 
 
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Count the queue calls of `work`. Run `work` once before, so that it builds no kernels and allocates nothing."""
+    """Count the queue calls of `work`.
+
+    Call `work` once before this function, so that it no longer builds kernels or allocates arrays.
+    """
     before = replace(device.calls)
     work()
     return device.calls.since(before)
@@ -190,7 +198,8 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
 
 
 _VIEWS = 8
-"""Number of times that the view is in the scene: few steps begin an epoch, in which the next view is not known."""
+"""Number of times that the view is in the scene. In the last step of an epoch the next view is not known, so that its
+chunks are not culled ahead. With longer epochs, there are fewer such steps."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,6 +69,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
     A run, or a run's model file, gives the model and the first view of the run's scene. Another model file gives the
     model and a camera in front of it. A scene gives the initial Gaussians and the first view.
     size: width and height of the frame in pixels; None for the camera's.
+    progress: function that is called with a text and the completed fraction; None for no calls.
     """
     run = run_of(path)
     if run is not None and not path.is_dir() and path != run.model_path:
@@ -102,7 +103,10 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """Return a copy of the Gaussians with origin zero, and a camera without rotation that sees most of them."""
+    """Return a copy of the Gaussians with origin zero, and a camera without rotation that sees most of them.
+
+    width, height: size of the camera's picture in pixels.
+    """
     low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
     focal = 0.9 * width
     half = np.maximum(high - middle, middle - low)

@@ -99,7 +99,7 @@ def run(verb: BenchVerb, services: Services) -> int:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Parse WIDTHxHEIGHT to (width, height). Raises InputError."""
+    """Parse WIDTHxHEIGHT to (width, height). None stays None. Raises InputError."""
     if text is None:
         return None
     words = text.split("x")

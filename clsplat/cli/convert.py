@@ -104,7 +104,7 @@ class ConvertVerb(Verb):
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
-    """Keep the Gaussians whose mean lies in this box. Write --crop=-1,... if it begins with a negative number."""
+    """Keep the Gaussians whose mean lies in this box. Write --crop=-1,... if the first number is negative."""
     crop_sphere: Annotated[str | None, arg(metavar="X,Y,Z,R")] = None
     """Keep the Gaussians whose mean lies in this sphere."""
     prune_opacity: Annotated[float | None, arg(metavar="FLOAT")] = None
@@ -119,11 +119,11 @@ class ConvertVerb(Verb):
     numbers row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
     rotate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
     """Rotate the model by these angles in degrees about the world's x axis, then y, then z, by the right-hand rule.
-    Spherical harmonics are rotated too. Write --rotate=-90,0,0 if it begins with a negative number."""
+    Spherical harmonics are rotated too. Write --rotate=-90,0,0 if the first number is negative."""
     scale: Annotated[float | None, arg(metavar="FLOAT")] = None
     """Multiply positions and sizes by this factor, about the world's origin."""
     translate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """Translate the model. Write --translate=-1,0,0 if it begins with a negative number."""
+    """Translate the model. Write --translate=-1,0,0 if the first number is negative."""
     drop_sh: Annotated[int | None, arg(metavar="DEGREE")] = None
     """Leave out spherical harmonics (view-dependent colour) above this degree, 0 to 3."""
     up: Annotated[Literal["y", "z"] | None, arg(metavar="y|z")] = None
@@ -279,7 +279,7 @@ def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
 
 
 def _sh_bits(text: str | None) -> tuple[int, int] | None:
-    """Parse "6" or "5,4". Returns the bits of band 1 and of the higher bands. Raises InputError."""
+    """Parse "6" or "5,4" to the bits of band 1 and of the higher bands. None stays None. Raises InputError."""
     if text is None:
         return None
     words = [word.strip() for word in text.split(",")]

@@ -131,6 +131,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 
     Flags override the run's settings.
 
+    source: the scene's folder.
     trained: the run of the model; None for a model without a run.
     """
     from clsplat.runs.refined_lenses import through_refined

@@ -25,7 +25,10 @@ from clsplat.version import package_version
 
 
 def main(arguments: Sequence[str] | None = None, services: Services | None = None) -> int:
-    """Run one command line, by default `sys.argv`. Returns the exit status."""
+    """Run one command line, by default `sys.argv`. Returns the exit status.
+
+    services: functions that do the work of the verbs; None for those of this package.
+    """
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
         sys.stdout.flush()  # flush here: at exit the interpreter would print a traceback for a closed pipe

@@ -122,7 +122,7 @@ def _text_rules() -> tyro.constructors.ConstructorRegistry:
     """Return the rules by which tyro parses a path or a list of steps from one word.
 
     Lists of steps are written as 500,1000,2000, whereas tyro expects spaces.
-    An empty path is an error, as it comes from an unset shell variable: tyro would use the working directory.
+    An empty path is an error: it comes from an unset shell variable, and tyro would use the working directory.
     """
     registry = tyro.constructors.ConstructorRegistry()
 
@@ -203,7 +203,7 @@ def report(message: str, status: int, arguments: Sequence[str]) -> None:
 
 
 def as_json(message: str, status: int) -> str:
-    """Return the JSON object that --json prints for an error."""
+    """Return the JSON object that --json prints for an error. status: the exit status of the command."""
     return json.dumps({"error": message, "status": status})
 
 

@@ -304,6 +304,7 @@ def _train_run(
 def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run | None) -> tuple[Scene, TrainConfig]:
     """Load the scene, and print the findings about it. Returns the scene and the settings to train with.
 
+    source: the scene's folder.
     earlier: the run to continue; None for a new run.
     With --auto the settings are adapted to the findings.
     """
@@ -330,6 +331,7 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
 def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None = None) -> Scene:
     """Load the training scene with its initial points. Raises InputError if training on it would fail.
 
+    source: the scene's folder.
     earlier: the run to continue; None for a new run.
     """
     from clsplat.training.preparation import prepared

@@ -133,7 +133,8 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
 def _scene(services: Services, path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
     """Load the scene for its cameras and photos, or return None if there is no scene to show.
 
-    given: True if --scene names the scene. An unreadable scene is an error then, and otherwise a warning.
+    path: the scene's folder, or None.
+    given: True if --scene names the scene. Then an unreadable scene is an error; otherwise it causes a warning.
     """
     if path is None:
         return None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs of a small textured still life, rendered by a plain NumPy ray caster without splats.
 
-The demo and the tests of structure from motion need photos without a licence and without poses, which were not made by
-a splat renderer.
+The demo and the tests of structure from motion need photos that have no licence and no poses, and that no splat
+renderer has made.
 
 The scene is diffuse, apart from a mild highlight on the two balls. So its light (sun with soft shadows, sky) is baked
 into one texture per object, and a photo needs only the nearest hit and a texture look-up for each ray.
@@ -69,7 +69,10 @@ class Noise:
 
 
 def smooth_square(phase: Float32, softness: float) -> Float32:
-    """Return a square wave with period 1 and values in [0, 1] at phases (n,). Edges are soft, to avoid aliasing."""
+    """Return a square wave with period 1 and values in [0, 1] at phases (n,). Edges are soft, to avoid aliasing.
+
+    softness: near 0 for hard edges, 1 for almost a sine wave.
+    """
     return np.asarray(0.5 + 0.5 * np.tanh(np.sin(2 * np.pi * phase) / softness))
 
 
@@ -81,7 +84,10 @@ def palette_colour(value: Float32, colours: Palette) -> Float32:
 
 
 def speckled(colour: Float32, points: Float32, noise: Noise, wavelength: float) -> Float32:
-    """Add soft dark and light specks to colours (n, 3) at points (n, 3), since SIFT finds and matches small blobs."""
+    """Add soft dark and light specks to colours (n, 3) at points (n, 3), since SIFT finds and matches small blobs.
+
+    noise, wavelength: the noise from which specks are made, and the longest wavelength in it, in metres.
+    """
     fine = noise(points + 11, wavelength, 2, gain=0.8)[:, None]
     dark, light = np.clip(-1.7 * fine - 0.5, 0, 1), np.clip(1.7 * fine - 0.5, 0, 1)
     return np.asarray(colour * (1 - 0.55 * dark) + (0.97 - colour) * (0.45 * light))

@@ -42,7 +42,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
     """Run the demo: write photos/, scene/, run/ and turntable/ in `output`. Returns the evaluation, as in eval.json.
 
     Photos and cameras that an interrupted demo has completed are reused.
-    device: name of the device, as for `clsplat devices`.
+    device: the device's selector, as for `open_device`; None for the default device.
     iterations: number of training steps.
     Raises InputError if the folder has other files. Errors of COLMAP, training and rendering are passed on.
     """
@@ -80,7 +80,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as the demo's. Raises InputError for an unmarked folder with files that it would replace."""
+    """Mark a folder as the demo's. Raises InputError for an unmarked folder with files that the demo would replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]
@@ -97,7 +97,7 @@ def claim(output: Path) -> None:
 def make_scene(output: Path, progress: Progress = no_progress) -> Path:
     """Create photos in output/photos, and recover cameras and points in output/scene. Returns the scene's path.
 
-    Results that are complete already are reused. Raises InputError if output/photos holds other files.
+    Complete photos and a complete scene are reused. Raises InputError if output/photos holds other files.
     """
     photos, scene = output / "photos", output / "scene"
     existing = sorted(path.name for path in photos.glob("[!.]*"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays in device memory, each a buffer with a shape and a dtype; and a workspace of scratch arrays by name.
+"""Arrays in device memory, each a buffer with a shape and a dtype; and workspaces, which keep scratch arrays by name.
 
 To debug reads of uninitialised memory, CLSPLAT_POISON=1 fills every array with NaN (2143289344 as an integer) when it
 is allocated or taken from a workspace. CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number.
@@ -193,7 +193,7 @@ class DeviceArray:
         return DeviceArray(self.device, buffer, (stop - start, *self.shape[1:]), self.dtype)
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """Return an array of this shape in the same memory. It must not have more elements than this array."""
+        """Return an array of the given shape in the same memory, with at most as many elements as this array."""
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 
@@ -212,8 +212,10 @@ def _poison() -> NDArray[np.uint32] | None:
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Fill the first `nbytes` bytes of a buffer with the 32-bit `word`. The bytes after the last whole
-    word get its lowest byte."""
+    """Fill the first `nbytes` bytes of a buffer with the 32-bit `word`.
+
+    If `nbytes` is not a multiple of 4, the bytes after the last whole word get the lowest byte of `word`.
+    """
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)
@@ -222,7 +224,7 @@ def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nby
 
 
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
-    """An OpenCL buffer that allows weak references, by which the memory account learns that it is freed."""
+    """An OpenCL buffer that allows weak references, so that the memory account learns when the buffer is freed."""
 
 
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
@@ -339,11 +341,11 @@ photographs of a few sizes. When there are this many, the next one replaces them
 
 
 class Workspace:
-    """Scratch arrays on a device by name, and command buffers that use them.
+    """Scratch arrays on a device, kept by name, and command buffers that use them.
 
     A call of `array` with a name reuses the buffer of the last call with this name. A buffer that is too small is
-    replaced by a buffer of 1.5 times the required size, or of exactly the required size if `tight` is True. Then all
-    command buffers are dropped.
+    replaced by a buffer of 1.5 times the required size, or of exactly the required size if `tight` is True. When a
+    buffer is replaced, all command buffers are dropped.
     """
 
     def __init__(self, device: Device) -> None:
@@ -396,7 +398,7 @@ class Workspace:
             return result
         if known is not None:
             known[1].check(commands, numbers)
-            for read in known[1].reads:  # copy to the host arrays of the first call's result, which is returned
+            for read in known[1].reads:  # fills the first call's host arrays, as its result is returned
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         command_buffers = self._command_buffers.setdefault(of, {})

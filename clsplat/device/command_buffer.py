@@ -63,7 +63,7 @@ class CommandBuffer:
 
     entries: for each command a function that puts it on the queue, and its kernel if it is a launch.
     calls: how many commands of each kind were recorded.
-    anew: for each launch parameter, the function that sets an argument of its kernel, and the argument's index.
+    setters: for each launch parameter, the function that sets an argument of its kernel, and the argument's index.
     reads: the functions of `entries` that copy to the host.
     given: buffers in the recorded launches that a replay may replace by other buffers.
 
@@ -75,7 +75,7 @@ class CommandBuffer:
     def __init__(self, given: Sequence[cl.Buffer] = ()) -> None:
         self.entries: list[tuple[Kernel | None, Callable[[], Any]]] = []
         self.calls = Calls()
-        self.anew: list[tuple[Callable[[int, Any], None], int]] = []
+        self.setters: list[tuple[Callable[[int, Any], None], int]] = []
         self.reads: list[Callable[[], Any]] = []
         self._owned: list[tuple[Kernel, cl.Kernel]] = []
         self._described: list[tuple[object, ...]] = []
@@ -118,7 +118,7 @@ class CommandBuffer:
             own.set_arg(index, typed(value))
             if isinstance(value, (LaunchParameter, LaunchParameterWord)):
                 set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg, as it does not check types
-                self.anew.append((set_bytes, index))
+                self.setters.append((set_bytes, index))
                 self._numbers.append(value)
                 description.append(None)
             elif isinstance(value, cl.MemoryObjectHolder) and value.int_ptr in self._given:
@@ -137,7 +137,7 @@ class CommandBuffer:
         """
         values, old = self._format.pack(*numbers), self._set
         if values != old:
-            for place, (set_bytes, index) in enumerate(self.anew):
+            for place, (set_bytes, index) in enumerate(self.setters):
                 if (value := values[4 * place : 4 * place + 4]) != old[4 * place : 4 * place + 4]:
                     set_bytes(index, value)
             self._set = values

@@ -125,7 +125,8 @@ class Device:
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # not shown when the device is opened, as the self-test may then change the shape
+        # Warn here and not when the device is opened, as the self-test may change the shape in between.
+        if self._why_another:
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -154,7 +155,12 @@ class Device:
     def with_shape(
         self, label: str = "", *, lanes: int | None = None, items: int | None = None, chunks: int | None = None
     ) -> Device:
-        """Open this device again with another kernel shape, given by its label or by lanes, items and chunks."""
+        """Open this device again with another kernel shape.
+
+        label: the shape's label, such as 8x1; "" for this device's shape.
+        lanes, items, chunks: replace these fields of the `Shape`; None keeps a field. If one of them is given, the new
+        shape has neither `by_gaussian` nor `subgroups`.
+        """
         shape = self.shape.relabelled(label) if label else self.shape
         if lanes or items or chunks:
             shape = Shape(lanes or shape.lanes, items or shape.items, chunks or shape.chunks)
@@ -170,7 +176,7 @@ class Device:
 
     @property
     def is_another(self) -> bool:
-        """True if the driver failed in the preferred kernel shape, so that the device uses another one."""
+        """True if the driver failed in the preferred kernel shape, so that the device uses another shape."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
@@ -190,9 +196,10 @@ class Device:
 
     @property
     def row_alignment(self) -> int:
-        """Alignment of the first row of a view of an array (`DeviceArray.rows`), in rows of four bytes or more.
+        """The first row of a view (`DeviceArray.rows`) must be a multiple of this number.
 
-        OpenCL requires sub-buffers to be aligned, and kernels read whole vectors.
+        OpenCL requires sub-buffers to be aligned, and kernels read whole vectors. The number suffices for rows of at
+        least four bytes.
         """
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
@@ -231,8 +238,9 @@ class Device:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
-        """Run `work`. Return its result and a command buffer of the commands that it put on the queue, or None instead
-        of the command buffer if a replay of them is not possible.
+        """Run `work`. Return its result, and a command buffer of the commands that it put on the queue.
+
+        The second result is None if these commands cannot be replayed.
 
         given: buffers that a replay may replace by other buffers (`CommandBuffer`).
         """

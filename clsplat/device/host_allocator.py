@@ -25,8 +25,8 @@ _idle: list[NDArray[np.uint8]] = []
 
 
 def host_bytes(count: int) -> NDArray[np.uint8]:
-    """Allocate an uninitialised array (count,), aligned to HOST_ALIGNMENT_BYTES. Its memory is freed with the last view
-    of it."""
+    """Allocate an uninitialised array (count,), aligned to HOST_ALIGNMENT_BYTES. The memory is freed with the last view
+    of the array."""
     size = -(-count // HOST_ALIGNMENT_BYTES) * HOST_ALIGNMENT_BYTES
     if size < MIN_RECYCLED_BYTES:
         return _aligned(np.empty(size + HOST_ALIGNMENT_BYTES, np.uint8))[:count]

@@ -77,7 +77,12 @@ def _first(
     values: Sequence[Any],
     form: str,
 ) -> None:
-    """Prepare a kernel's first launch: set its argument types, and try it in the sandbox. Raises DriverError."""
+    """Prepare a kernel's first launch: set the types of its arguments, and try the launch in the sandbox.
+
+    size, local, values: as for `Device.enqueue`.
+    form: the kind of launch, a suffix from `form_of`.
+    Raises DriverError.
+    """
     types = [_type(value) for value in values]
     most = device.max_group
     if tells_group_sizes(device.cl_device):

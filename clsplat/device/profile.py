@@ -83,9 +83,8 @@ class Recorder:
     def recording(self, *, wait: bool) -> Iterator[dict[str, StageRecord]]:
         """Record the work in the block. Yields the records by stage, which are filled in at the end of the block.
 
-        wait: True waits for the device before and after each stage, to measure `wall_ms`. False does not wait; kernel
-        times then come from OpenCL's events. They are 0 if the queue was made without profiling, or the driver reports
-        wrong times.
+        wait: True waits for the device before and after each stage, to measure `wall_ms`.
+        The times of kernels come from OpenCL's events, and are 0 if the queue was made without profiling.
         """
         stages: dict[str, StageRecord] = {}
         self.on, self._wait, self._stages, self._events = True, wait, stages, []
@@ -141,9 +140,9 @@ their bytes count twice."""
 
 
 def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
-    """Mark a function as a stage of the pipeline; its first argument is the device.
+    """Mark a function, whose first argument is the device, as a stage of the pipeline.
 
-    updated: for kernels that the function launches, by name, the number of arrays that they both read and write.
+    updated: for kernels that the function launches, by name: the number of arrays that the kernel reads and writes.
     """
 
     def decorate(function: Callable[Concatenate[D, P], R]) -> Callable[Concatenate[D, P], R]:

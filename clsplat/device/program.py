@@ -52,7 +52,7 @@ def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Varian
 
 
 def text_of(stem: str) -> str:
-    """Return the source of `stem`.cl, modified as CLSPLAT_BREAK_KERNEL says. Raises InputError if that is invalid."""
+    """Return the source of `stem`.cl, modified as CLSPLAT_BREAK_KERNEL says. Raises InputError for an invalid value."""
     source = kernel_source(stem)
     wanted = os.environ.get(BREAK_KERNEL_VARIABLE)
     if not wanted:
@@ -135,7 +135,7 @@ class Kernel:
     def most_items(self, device: cl.Device) -> int:
         """Maximum work-items in a group of this kernel: what the driver reports, or its `reqd_work_group_size`.
 
-        The larger of the two counts, as NVIDIA's driver reports 256 also for kernels that it has built for 1024.
+        Returns the larger of the two, as NVIDIA's driver reports 256 even for kernels that it has built for 1024.
         """
         info = cl.kernel_work_group_info
         reported: int = self.cl_kernel.get_work_group_info(info.WORK_GROUP_SIZE, device)

@@ -109,8 +109,8 @@ def _process(index: int) -> _Process:
 class KernelTrials:
     """The trials of a driver in one kernel shape, and the names of the builds and launches that passed.
 
-    A worker process that tests a driver, such as `clsplat.selftest.worker`, uses no sandbox. In it, the function `say`,
-    if set, is called with the name of each kernel before the kernel's first use.
+    A worker process that tests a driver, such as `clsplat.selftest.worker`, uses no sandbox. Such a process may set
+    `say`, a function that is called with the name of each kernel before the kernel's first use.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:
@@ -141,6 +141,7 @@ class KernelTrials:
     ) -> None:
         """Try a launch of the kernel with arguments of these sizes and values. Raises DriverError.
 
+        size, local: as for `Device.enqueue`.
         form: the kind of launch, a suffix from `launch.form_of`.
         """
         given = [_described(argument) for argument in arguments]
@@ -180,7 +181,7 @@ class KernelTrials:
             self._failed[name] = str(error)  # the error is kept, so that this process does not repeat the trial
             raise error
         self.known[name] = str(answer.get("salt", ""))
-        if "salt" in answer:  # no salt means that the compiler has refused the text, as it will in this process
+        if "salt" in answer:  # without a salt, the compiler has refused the text, and this process will report that
             driver_records.remember(self._device, self._shape, kernels={name: self.known[name]})
 
     def fail(
@@ -195,7 +196,6 @@ class KernelTrials:
         """Return the error to raise if the driver fails in a kernel file or in a kernel.
 
         trouble: the failure, as a predicate of a sentence.
-
         trial: the failed trial (`driver_records.Entry`), if there was one.
         lasting: True also records the failure, so that the driver is not used in this shape again.
         """

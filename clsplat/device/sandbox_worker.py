@@ -75,8 +75,10 @@ class _TrialDevice:
 
 
 def _serve(index: int) -> None:
-    """Answer the parent's messages until its pipe is closed. If a driver hangs, this process ends after 1.5 times the
-    message's time limit, with a traceback."""
+    """Answer the parent's messages, on the `index`-th device, until the parent closes the pipe.
+
+    If a driver hangs, this process ends after 1.5 times the message's time limit, with a traceback.
+    """
     device = None
     for line in sys.stdin:
         message = json.loads(line)

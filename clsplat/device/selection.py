@@ -35,7 +35,8 @@ class DeviceInfo:
 def list_devices() -> list[DeviceInfo]:
     """Describe every visible OpenCL device, in the order of their index, as `clsplat devices` lists them.
 
-    Raises DeviceError if CLSPLAT_SHAPE or CLSPLAT_PRETEND is invalid for every device.
+    Raises DeviceError if CLSPLAT_SHAPE or CLSPLAT_PRETEND is malformed. If a device cannot run CLSPLAT_SHAPE,
+    the `shape` of its entry says so.
     """
     asked_shape()
     return [
@@ -76,7 +77,7 @@ def select(selector: str | None) -> cl.Device:
     With None, CLSPLAT_DEVICE is the selector. If it is not set either, a GPU is preferred: the result is the
     first GPU, or without a GPU the first device. Raises DeviceError.
     """
-    driver_timeout()  # raises InputError if CLSPLAT_DRIVER_TIMEOUT is invalid, before the first kernel does
+    driver_timeout()  # refuses an invalid CLSPLAT_DRIVER_TIMEOUT now and not at the first kernel
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
@@ -171,7 +172,7 @@ def open_devices(
 
 
 def open_device(selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False) -> Device:
-    """Open the one device that `selector` names (see `open_devices`)."""
+    """Open the one device that `selector` names. All arguments are as for `open_devices`."""
     if len(_names(selector)) > 1:
         raise DeviceError(f"--device {selector}: expected one device here; only train and render take several")
     return open_devices(selector, memory_limit, profile=profile)[0]

@@ -26,7 +26,7 @@ class _Slot:
     key: the caller's key of the uploaded array (`UploadRing.begin`).
     held: the uploaded array, in the memory of `array`.
     arrived: event of the copy to the device.
-    used: event after the last launch that uses the uploaded array; None if it has not been put on the queue yet.
+    used: event after the last launch that uses the uploaded array; None until this event is on the queue.
     """
 
     array: DeviceArray
@@ -53,7 +53,7 @@ class UploadRing:
         """The slots, in order of their last use; the least recently used is first."""
 
     def begin(self, key: object, values: NDArray[Any]) -> None:
-        """Start to upload the host array `values`. `take` returns it by its key.
+        """Start to upload the host array `values`. `take` with the same key returns the copy on the device.
 
         Does nothing if the array is larger than a slot, or an array with this key is in the ring.
         """

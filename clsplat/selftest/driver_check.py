@@ -3,7 +3,7 @@
 passes and failures.
 
 A driver record is keyed by device, driver version, kernel shape and kernel sources. `clsplat selftest` always tests,
-whatever the records say. If the test passes, it deletes a recorded failure.
+whatever the records say. If it passes, a recorded failure is deleted (`examine_device`).
 """
 
 from __future__ import annotations
@@ -38,10 +38,9 @@ class DriverReport:
     digests: digests of the stages' results, by "scene/stage".
     build_seconds: seconds to build all kernels; None if they were not built before the test.
     end: description of how the worker process ended, if it did not finish its work; otherwise empty.
-    crashed: True if the driver ended the process.
-    hung: True if the process did not answer in time.
+    crashed: True if the driver ended the process, did not answer in time (`hung`), or failed with an error.
     wanted: names of the stages that were to be tested.
-    kernels: the kernels that were built and launched, named as in `device.sandbox`.
+    kernels: names of the builds and launches of the test, each with the salt of its build (`KernelTrials.known`).
     remembered: a recorded failure in this kernel shape that this test did not clear, or empty.
     """
 
@@ -116,13 +115,14 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *
 
 
 def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
-    """Test a device at its first use, and record that it passed. The test takes a second, and the time to build
-    kernels.
+    """Test a device at its first use, and record that it passed. Returns the device.
 
-    Nothing is tested if a record says that the stages have passed, or if CLSPLAT_TRUST_DRIVER=1.
+    The test takes a second, and the time to build kernels. Nothing is tested if a record says that the stages have
+    passed, or if CLSPLAT_TRUST_DRIVER=1.
 
-    stages: the stages of SELFTEST_STAGES that will be used. FORWARD_STAGES are always tested too. Returns the device.
-    If the driver crashes or hangs in the device's kernel shape, this warns and returns the device in another shape.
+    stages: the stages of SELFTEST_STAGES that will be used. FORWARD_STAGES are always tested too.
+    If the driver crashes or hangs in the device's kernel shape, a warning is given, and the result is the device in
+    another shape.
     Raises DriverError if the driver crashes or hangs in every shape, and DeviceError if results are wrong.
     """
     if regardless():
@@ -180,7 +180,7 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
 def examine_device(index: int) -> DriverReport:
     """Run the whole self-test on the `index`-th device, in the kernel shape that is preferred for it.
 
-    If the test passes, a recorded failure in this shape is deleted, unless the kernel of that failure fails again.
+    If the test passes, a recorded failure in this shape is deleted, unless the kernel that had failed fails again.
     """
     device = all_devices()[index]
     shape = wanted_shape(device)

@@ -32,7 +32,7 @@ LENS_STAGES = ("lens",)
 CHUNK_STAGES = ("bounds", "chunks", "catch_up", "chunk_records")
 """Further stages for training of models of several chunks."""
 LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
-"""Further stages for the library's calls."""
+"""Further stages for the functions of `clsplat.library`."""
 TRAINING_STAGES = (*FORWARD_STAGES, *BACKWARD_STAGES)
 SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),

@@ -92,7 +92,7 @@ def run(
         for bench in benches:
             try:
                 outcomes.append(OUTCOMES_BY_STAGE[name](bench))
-            except DriverError:  # the caller may try another kernel shape
+            except DriverError:  # ends the run, as the caller may try another kernel shape
                 raise
             except Exception as error:  # noqa: BLE001
                 # A driver may raise any exception, and so may code that uses wrong sizes from a faulty kernel.

@@ -116,8 +116,8 @@ def test_only_numbers_that_have_changed_are_set(device: Device, words: Kernel) -
 
     _, commands = device.record(make)
     assert commands is not None
-    places = enumerate(commands.anew)
-    commands.anew = [(lambda _, value, place=place: sets.append((place, value)), index) for place, (_, index) in places]
+    setters = enumerate(commands.setters)
+    commands.setters = [(lambda _, value, at=at: sets.append((at, value)), index) for at, (_, index) in setters]
     for numbers, expected in (((0.5, 0.0), []), ((0.5, -0.0), [1]), ((0.25, -0.0), [0]), ((0.5, 0.0), [0, 1])):
         sets.clear()
         commands.set(numbers)

@@ -71,8 +71,8 @@ class RenderVerb(Verb):
     count: OptionalInt = None
     """Number of frames of the path; 120 if not given."""
     frames: Annotated[str | None, arg(metavar="1-100,200-300:2,...")] = None
-    """Render only these frames; all if not given. Ranges may have a step. Write --frames=-5-10 if it begins with a
-    negative number."""
+    """Render only these frames; all if not given. Ranges may have a step. Write --frames=-5-10 if the first number is
+    negative."""
     usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
     """Path or name of the camera, for a USD stage with several cameras."""
     lenses: Annotated[Lenses | None, arg(metavar="undistort|native")] = None

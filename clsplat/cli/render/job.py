@@ -162,7 +162,7 @@ def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool
 
 
 def _check_pair(task: Task, left: Camera, right: Camera) -> None:
-    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio: its parts share these."""
+    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio, which its parts share."""
     values = {"size": [f"{frame.width}x{frame.height}" for frame in (left.window or left, right.window or right)]}
     if task.optics is not None:
         # compare as float32, the precision in which EXR headers store the pixel aspect ratio
@@ -260,7 +260,7 @@ def _plan_document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
 
 
 def _plan_lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> Iterator[str]:
-    """Yield the plan of --dry-run as lines of text."""
+    """Yield the plan of --dry-run as lines of text. document: the plan as from `_plan_document`."""
     frames = document["frames"]
     paths = dict.fromkeys((frames[0]["path"], frames[-1]["path"]))
     spaces = dict.fromkeys((document["model_colorspace"], document["colorspace"]))
@@ -286,7 +286,10 @@ def _plan_lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan])
 
 
 def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the distinct picture sizes as texts. If a picture is a part of the frame, the text gives its position."""
+    """Return the distinct picture sizes as texts. If a picture is a part of the frame, the text gives its position.
+
+    frames: the entries "frames" of `_plan_document`.
+    """
     sizes = {(frame["width"], frame["height"], tuple(frame.get("window", ()))) for frame in frames}
     texts = []
     for width, height, window in sorted(sizes):
@@ -368,6 +371,7 @@ def write_frames(job: Job, renderers: Sequence[Any]) -> int:
 def _print_profile(records: Iterable[Record], wall: float, devices: int) -> None:
     """Print the percentages of the wall time in which a device ran kernels and transfers, on average over all devices.
 
+    records: the records of all frames, with their device times.
     wall: wall time of all frames in seconds.
     devices: number of devices.
     """

@@ -197,7 +197,7 @@ def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
     if flags.workers is not None and flags.workers < 1:
         raise InputError(f"--workers {flags.workers}: expected at least 1")
     if flags.workers is not None and flags.scheduler is not None:
-        raise InputError("--workers and --scheduler exclude each other: they start a cluster, or use a running one")
+        raise InputError("--workers and --scheduler exclude each other: --workers starts its own cluster")
     words = [word.strip() for word in flags.device.split(",")] if flags.device else []
     if not words:
         return (None,)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of `clsplat render`: the shot that its flags ask for, one for each eye with --stereo, and the settings taken
-from a USD stage."""
+"""Cameras of `clsplat render`: the shot that its flags ask for, or with --stereo a shot for each eye, and the settings
+taken from a USD stage."""
 
 from __future__ import annotations
 
@@ -74,7 +74,10 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
 
 
 def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str | None) -> dict[str, str]:
-    """Find the path of each eye's camera in the USD stage, for --stereo stage. Raises InputError."""
+    """Find the path of each eye's camera in the USD stage, for --stereo stage. Raises InputError.
+
+    cameras, usd_camera: values of --cameras and --usd-camera; None for flags that are not given.
+    """
     if cameras is None or cameras.suffix.lower() not in USD_SUFFIXES:
         raise InputError(f"--stereo stage: expected a USD stage in --cameras, not {cameras or 'none'}")
     pair = dict(zip(EYES, pair_of_stage(cameras, usd_camera), strict=True))
@@ -139,6 +142,7 @@ def _framing(
 ) -> FramingConfig | None:
     """Return the framing that renders a data window, as a region or an overscan of the camera's frame.
 
+    source: the stage's file, for messages.
     window: left, bottom, right and top as fractions of the frame. A pixel is rendered if the window covers its centre.
     The result is None if the window extends beyond the frame, but not equally on all sides as an overscan does.
     """

@@ -92,7 +92,11 @@ def block_generator(seed: int, purpose: int, i: int, j: int, *more: int) -> np.r
 
 
 def car(builder: Builder, x: float, y: float, turn: float, paint_of_car: Float64) -> None:
-    """Add a car, 4.2 metres long, at x, y in metres. turn: its direction, as an angle from x in radians."""
+    """Add a car, 4.2 metres long, at x, y in metres.
+
+    turn: the driving direction, as an angle from x in radians.
+    paint_of_car: (3,), red, green and blue of the body.
+    """
     tint = (float(paint_of_car[0]), float(paint_of_car[1]), float(paint_of_car[2]))
     body, glass = Cover(paint.PLAIN, 4.0, tint), Cover(paint.PLAIN, 4.0, (0.07, 0.09, 0.11))
     back = np.array([np.cos(turn), np.sin(turn)]) * 0.25
@@ -126,7 +130,7 @@ def _tree(builder: Builder, generator: np.random.Generator, x: float, y: float, 
 
 
 def _house(builder: Builder, generator: np.random.Generator, x: float, y: float, turn: float) -> None:
-    """Add a detached house at x, y in metres, with a chimney and a gabled roof. turn: angle of its ridge from x."""
+    """Add a detached house at x, y in metres, with a chimney and a gabled roof. turn: angle from x to the ridge."""
     half = [float(generator.integers(least, least + 2)) * WINDOW_METRES / 2 for least in (3, 2)]
     eaves = STOREY_METRES * float(generator.integers(1, 3)) + 0.15
     shift = (float(generator.integers(4)) / 4, 0.0)

@@ -171,7 +171,8 @@ def _upright(generator: np.random.Generator) -> Float64:
 def _gain(config: TownConfig, flight: int, i: int, j: int, index: int) -> float:
     """Return the exposure factor of a photograph. It differs between flights, and drifts along each flight.
 
-    flight: number of the flight over the row of blocks j. i, index: the photograph's block and index in the block.
+    flight: number of the flight. A flight passes over all blocks with the same index `j`.
+    i, index: index of the photograph's block along x, and index of the photograph in its block.
     """
     if config.exposure == 0:
         return 1.0

@@ -28,7 +28,7 @@ class TownConfig:
 
     columns, rows: number of photographed blocks along x and y. The town itself is endless.
     photos: number of photographs of each block.
-    width, height: size of a photograph in pixels. A panorama has half its width as height.
+    width, height: size of a photograph in pixels. The height of a panorama is half its width.
     seed: seed of the town, of the cameras and of all noise.
     rig: kind of camera in the streets, a `TownRig`.
     exposure: largest deviation of a photograph's exposure from the mean, in stops.

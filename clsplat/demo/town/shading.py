@@ -160,7 +160,7 @@ class Shader:
         inner = np.minimum(_to_street(fx), _to_street(fy))
         lot_x, lot_y = ((place - PAVEMENT_METRES) * np.float32(1 / LOT_METRES) for place in (fx, fy))
         lot = np.clip(lot_x, 0, 2.5).astype(np.int64) + 3 * np.clip(lot_y, 0, 2.5).astype(np.int64)
-        far = np.abs(column) + np.abs(row) > 1e6  # near the horizon, haze hides the ground
+        far = np.abs(column) + np.abs(row) > 1e6  # near the horizon haze hides the ground, so any block will do
         column, row = (
             np.where(far, 0, column).astype(np.int64) + first[0],
             np.where(far, 0, row).astype(np.int64) + first[1],

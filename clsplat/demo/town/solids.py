@@ -115,7 +115,10 @@ class Builder:
         self._rows: list[_Row] = []
 
     def box(self, centre: Triple, half: Triple, side: Cover, top: Cover, turn: float = 0.0) -> None:
-        """Add a box with covers for its sides and its top. The underside has the cover of the sides."""
+        """Add a box with covers for its sides and its top. The underside has the cover of the sides.
+
+        half: half sizes along the box's own axes.
+        """
         self._rows.append(_Row(SOLID_BOX, centre, half, turn, side, top))
 
     def roof(self, base: Triple, half: Triple, slope: Cover, gable: Cover, turn: float = 0.0) -> None:

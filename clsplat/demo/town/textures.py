@@ -133,7 +133,7 @@ def _paint(image: Pixels, box: tuple[float, float, float, float], colour: Any) -
 
 
 def _facade(kind: int, brush: Brush) -> Pixels:
-    """Paint a facade (h, w, 3) of four storeys with four windows each. The first five kinds have a door."""
+    """Paint a facade (h, w, 3) of four storeys with four windows each. kind: its number; the first five have a door."""
     image = _wall(kind, brush)
     cell = TEXTURE_SIDE / 4
     wide, tall = ((0.40, 0.48), (0.52, 0.56), (0.84, 0.58))[kind // 3]

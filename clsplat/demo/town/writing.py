@@ -113,7 +113,10 @@ def check_folder(output: Path, *, overwrite: bool) -> None:
 def _take_all(
     result: Path, config: TownConfig, planned: Sequence[TownPhotograph], workers: int, progress: Progress
 ) -> list[Observations]:
-    """Ray-cast and write all photographs. Returns the points that each photograph shows."""
+    """Ray-cast and write all photographs. Returns the points that each photograph shows.
+
+    result: folder of the town while it is written. workers: number of threads.
+    """
     for i, j in sorted({(shot.i, shot.j) for shot in planned}):
         for folder in ("images", "masks") if config.cars else ("images",):
             (result / folder / f"{i:04d}_{j:04d}").mkdir(parents=True)
@@ -145,6 +148,7 @@ def _write_model(
 ) -> int:
     """Write the COLMAP model: cameras, images and points. Returns the number of points.
 
+    result: folder of the town while it is written.
     planned, seen: the photographs, and the points that each of them shows.
     """
     sparse = result / "sparse" / "0"

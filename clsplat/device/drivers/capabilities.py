@@ -61,7 +61,7 @@ def pretended() -> str:
 
 
 def capabilities_of(device: cl.Device) -> Capabilities:
-    """Return a device's capabilities, changed as CLSPLAT_PRETEND says. Raises DeviceError if that is invalid."""
+    """Return a device's capabilities, changed as CLSPLAT_PRETEND says. Raises DeviceError for an invalid value."""
     from pyopencl import device_fp_config
 
     exact = bool(device.single_fp_config & device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)

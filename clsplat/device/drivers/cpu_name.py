@@ -58,7 +58,7 @@ def better_name(name: str, present: frozenset[str]) -> str:
 
 
 def name_processor(device: cl.Device) -> str:
-    """Replace the processor name in a device record of PoCL 3.0 by a name that its compiler accepts.
+    """Replace the processor name in a device record of PoCL 3.0 by a name that PoCL's compiler accepts.
 
     Returns the resulting name. For other drivers, and if no name is found in the record, nothing is changed, and the
     result is "".

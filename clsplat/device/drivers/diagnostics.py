@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnosis of an installation: GPUs of the machine, driver files and devices, with advice on missing parts.
 
-Each check runs in a process of its own, because loading a driver may crash the process.
+Each check that loads a driver runs in a process of its own, because the driver may crash this process.
 """
 
 from __future__ import annotations
@@ -109,9 +109,9 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
 
 
 def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Diagnostic]:
-    """Return a finding for each device; or one finding with advice if there is no device or they were not listed.
+    """Return a finding for each device. If there is none or they could not be listed, return one finding with advice.
 
-    trouble: why the devices could not be listed, or an empty string.
+    devices, trouble: the results of `listed_devices`.
     """
     if trouble or not devices:
         return [Diagnostic("device", "missing", trouble or "no OpenCL device found", driver_advice())]
@@ -123,7 +123,10 @@ def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Dia
 
 def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
     """Return a finding for each device whose kernels have several work-items in a group. It says whether training lists
-    each tile's Gaussians by append or by radix sort."""
+    each tile's Gaussians by append or by radix sort.
+
+    devices: as from `listed_devices`.
+    """
     findings = []
     for info in devices:
         if " x 1 items" in info["shape"]:
@@ -140,7 +143,10 @@ def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
 
 
 def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
-    """Return a finding for each of the GPU makers, which says whether OpenCL lists a GPU of this maker."""
+    """Return a finding for each GPU maker in `makers`, which says whether `devices` has a GPU of this maker.
+
+    devices: as from `listed_devices`.
+    """
     findings = []
     for maker in makers:
         shown = any(info["kind"] == "gpu" and of_maker(info["platform"], info["name"], maker) for info in devices)

@@ -75,7 +75,7 @@ def kind_of(device: cl.Device) -> str:
 
 
 def title(device: cl.Device) -> str:
-    """Return the names of a device and its driver, without PoCL's build options, which follow two spaces."""
+    """Return the names of a device and its driver, without the build options that PoCL adds after two spaces."""
     return f"{device.name.strip()}, {device.platform.version.split('  ')[0].strip()}"
 
 
@@ -225,8 +225,10 @@ def offer_packaged(
     """Set OCL_ICD_FILENAMES so that, on Windows, OpenCL's loader finds the Intel CPU driver that pip has installed.
 
     Otherwise the loader only finds drivers in the registry, which pip does not write. In a process with administrator
-    rights it ignores the variable. If the variable is already set, it is kept. On Linux the loader finds the PoCL that
-    pip has installed by itself; macOS has no loader.
+    rights the loader ignores the variable. A variable that is already set is kept. On Linux the loader itself finds the
+    PoCL that pip has installed; macOS has no loader.
+
+    prefix: folder of the Python installation. environment: environment variables to change.
     """
     driver = Path(prefix) / _INTEL_DRIVER_PATH
     if windows and _ICD_FILENAMES not in environment and driver.is_file():
@@ -234,7 +236,7 @@ def offer_packaged(
 
 
 def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Path | None:
-    """Make a cache folder for PoCL, in this process and its children, if PoCL cannot make one in the home folder.
+    """Make a cache folder for PoCL in this process and its children, if PoCL cannot make one in the home folder.
 
     Without a cache folder PoCL shows no device, as if it were not installed. Returns the folder, which is removed when
     this process ends; None if no folder is needed or none can be made.

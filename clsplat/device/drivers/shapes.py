@@ -39,7 +39,7 @@ class Shape:
     by_gaussian: in the gradient of blending, a work-item has a Gaussian and loops over pixels; if False, it has pixels
     and loops over Gaussians (docs/decisions/0023-a-group-shares-a-tile.md). True only in BY_GAUSSIAN_SHAPES.
     subgroups: in the gradient of blending, the work-items of a sub-group sum by exchanging values. The sums have the
-    same bits. True only in SUBGROUP_SHAPES.
+    same bits as without sub-groups. True only in SUBGROUP_SHAPES.
     """
 
     lanes: int
@@ -50,7 +50,7 @@ class Shape:
 
     @property
     def label(self) -> str:
-        """The value of CLSPLAT_SHAPE for this shape: LANESxITEMS, with suffix `g` by Gaussian, `s` with sub-groups."""
+        """The value of CLSPLAT_SHAPE for this shape: LANESxITEMS, then `g` if `by_gaussian`, or `s` if `subgroups`."""
         return f"{self.lanes}x{self.items}{'g' if self.by_gaussian else 's' if self.subgroups else ''}"
 
     @property

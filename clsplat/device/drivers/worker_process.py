@@ -43,12 +43,14 @@ class WorkerEndedError(Exception):
     text: the end of a sentence whose subject is the process, such as "was ended by signal 6".
     hung: True if the process was ended because it did not answer in time.
     status: exit status of the process; negative for a signal.
+    crashed: True if a driver has ended or blocked the process.
+    killed: True if SIGKILL has ended the process, as happens if memory runs out.
     """
 
     def __init__(self, text: str, status: int = 0, *, hung: bool = False) -> None:
         super().__init__(text)
         self.hung = hung
-        # True if a driver has ended the process. After an exception in Python the status is 1 or 2.
+        # after an exception in Python the status is 1 or 2; SIGTERM and SIGKILL come from outside
         self.crashed = hung or status not in (0, 1, 2, _SIGTERM, _SIGKILL)
         self.killed = status == _SIGKILL
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the colour models: photographs without their own colours, the gradient, and the update by Adam."""
+"""Cases of the colour models: removal of a photograph's own colours, the gradient, and the update by Adam."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) 
 
 
 def _pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> Arrays:
-    """Read the photograph after the launch, and the planes that must not change: its alpha, and the gradient."""
+    """Read the photograph after the launch, and the planes that must not change: alpha and the gradient."""
     planes, by_image = target.get(), cropped(gradient.get(), given.size)
     return {"target": cropped(planes[:3], given.size), "alpha": planes[3], "gradient": by_image}
 

@@ -212,7 +212,7 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def _launch_whole(device: Device, given: Inputs, held: DeviceGaussians, camera_array: DeviceArray) -> Read:
-    """Launch the projection of the whole model and its gradient."""
+    """Launch the projection of the whole model, and the gradient of this projection."""
     whole = project(device, Workspace(device), held, given.camera, camera_array)
     gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
     screen = Screen(upload(device, np.zeros((held.count, 2), np.float32)))

@@ -164,7 +164,7 @@ def _blend(bench: CaseBench) -> StageOutcome:
     wanted, clear = bench.blend_reference()
     image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
     exact = (wanted.image[clear], wanted.transmittance[clear])
-    # In so small a frame, a GPU divides a tile among more work-items than usual. The bits must be the same.
+    # Without `items`, a GPU divides the tiles of such a small frame among more work-items. The bits must be the same.
     other = blend(device, bench.work, bench.lists, bench.inputs)
     wrong = int((other.image.get() != outcome.arrays[0]).sum())
     parts = {"image": (image, exact[0]), "transmittance": (transmittance, exact[1])}

@@ -72,7 +72,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     seen, terms = reference.apply(image, own), reference.apply(np.abs(image), np.abs(own))
     by_image, by_grid = reference.gradient(image, own, by_seen)
     by_grid += given.weight * reference.variation_gradient(own)
-    # Adam's twin gets the device's gradient, so that its error is compared only once, in "by grid".
+    # Adam's twin gets the device's gradient, so that the gradient's error is compared only once, in "by grid".
     step = (got["by grid"].astype(np.float64), given.visit, given.rate)
     got |= {f"{name} of another": got[name][0] for name in ("first", "second")}
     held[at], first[at], second[at] = reference.step(own, first[at], second[at], *step)

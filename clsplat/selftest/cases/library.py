@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the stages behind the library's calls, and of their gradients.
+"""Self-test of the stages that only the functions of `clsplat.library` launch, and of their gradients.
 
 The stages are EWA projection with any view matrix, SH colours, splats from arrays, and blending of any number of values
 per Gaussian.
@@ -184,10 +184,11 @@ def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Expected]:
     return {
         # the bound covers three roundings; errors are relative to a row's largest entry, because l12 may be near 0
         "whitening": Expected(wanted.whitenings, 5e-7, size, seen),
-        # an extent depends on a difference of logarithms, which may cancel; the tile test has 0.01 px of slack for it
+        # An extent depends on the difference of two logarithms that may be nearly equal.
+        # The tile test allows for an error of 0.01 px.
         "half extents": Expected(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
         "LOG2O": Expected(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
-        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # the rounded fractions of a pixel are below 1
+        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # only fractions of a pixel are rounded
         "values": exactly(given.values[seen]),
         "tiles of culled Gaussians": exactly(np.zeros_like(got["tiles of culled Gaussians"])),
     }
@@ -204,8 +205,8 @@ SPLATS_CASE = Case(
 
 
 def of_values(bench: CaseBench) -> StageOutcome:
-    """Test the blending of VALUES_PER_GAUSSIAN values per Gaussian with the weights of the scene's image, and its
-    gradient."""
+    """Test the blending of VALUES_PER_GAUSSIAN values per Gaussian, with the weights of the scene's image, and the
+    gradient of this blending."""
     device, camera, n = bench.device, bench.camera, bench.model.count
     size = (camera.height, camera.width)
     given, behind = evenly(91, (n, VALUES_PER_GAUSSIAN), -1.0, 1.0), evenly(92, (VALUES_PER_GAUSSIAN,), 0.0, 1.0)

@@ -32,7 +32,8 @@ rounding may change the gradient's sign."""
 def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
     """Return a random render and a random photograph, (H, W, 3) each.
 
-    They are noise or of one colour, may be dark, and may be nearly equal. Half of the photographs have 8-bit values.
+    The photograph is noise or of one colour, and may be dark. The render may be nearly equal to it. Half of the
+    photographs have 8-bit values.
     """
     width, height = size
     y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])

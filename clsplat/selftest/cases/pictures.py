@@ -272,7 +272,8 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
     parts = _tangent_parts(tangents, shown, splats)
     if bench.model.count <= MAX_GAUSSIANS_FOR_REFERENCE:
         picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
-        # three times as large as in other stages, as float32 directions are off by 1e-7 at pixels 0.1 radians wide
+        # The margin is three times as large as in other stages, because float32 directions are off by 1e-7 at pixels
+        # 0.1 radians wide.
         clear = picture.margin > 3 * MIN_DECISION_MARGIN
         solid = clear & (picture.alpha > 0.5)
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])

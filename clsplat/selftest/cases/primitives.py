@@ -72,7 +72,7 @@ SCAN_SIZES = (
 def _random_keys(rng: Generator, count: int) -> Inputs:
     """Random sort keys. base: a number, at most the smallest key, that is subtracted from all keys before the sort.
 
-    bits: number of low bits, few or many, in which the differences are random.
+    bits: number of low bits in which the differences from `base` are random.
     """
     bits = int(rng.choice([1, 4, 5, 11, 12, 13, 22, 23, 24, 26, 27, 31, 32, 32]))
     base = int(rng.choice([0, 0, 2**32 - 2**bits, rng.integers(2**32 - 2**bits + 1)]))
@@ -181,7 +181,7 @@ def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.in
 def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.int64]:
     """Random boxes (count, 4) of tiles, with x0, x1, y0 and y1 each. tiles: numbers of tiles across and down.
 
-    A box is empty, is small, has whole rows, or now and then all tiles.
+    Boxes are empty, are small, have whole rows of tiles, or in rare cases have all tiles.
     """
     begin = rng.integers(0, tiles, (count, 2))
     end = np.minimum(begin + rng.integers(1, 5, (count, 2)), tiles)

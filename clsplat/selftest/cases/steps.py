@@ -145,14 +145,14 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     """Random inputs of late Adam: rows that missed 0 to MOST_MISSED steps up to step `step`, with moments of any
     magnitude, some of them zero.
 
-    first_step: the last step that all rows have taken.
-    rates: learning rates of each step after `first_step`, by parameter group.
+    common_step: the last step that all rows have taken.
+    rates: learning rates of each step after `common_step`, by parameter group.
     every: number of steps between updates of the SH bands from degree 1 on.
     """
     span, every = int(rng.choice([1, 7, 40, MOST_MISSED])), int(rng.choice([1, 2]))
-    first_step = int(rng.choice([0, 1, 100, 30_000]))
-    last = first_step + rng.integers(0, span + 1, count)
-    last[0] = first_step
+    common_step = int(rng.choice([0, 1, 100, 30_000]))
+    last = common_step + rng.integers(0, span + 1, count)
+    last[0] = common_step
     made: dict[str, Arrays] = {name: {} for name in ("parameters", "first", "second")}
     for group, shape in group_shapes(count, int(rng.choice([1, 16]))).items():
         size = 10 ** rng.uniform(-9, 6, shape)  # moments far above Adam's epsilon
@@ -163,8 +163,8 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     rates = {group: 10 ** rng.uniform(-5, -1) * fall for group in PARAMETER_GROUPS}
     return Inputs(
         arrays=made,
-        first_step=first_step,
-        step=first_step + span,
+        common_step=common_step,
+        step=common_step + span,
         last=last.astype(np.uint32),
         rates=rates,
         every=every,
@@ -176,7 +176,7 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
 def _launch_settle(device: Device, _: Workspace, given: Inputs) -> Read:
     config = OptimiserConfig(sh_rest_every=given.every)
     missed = MissedSteps(config, tuple(PARAMETER_GROUPS))
-    for index, number in enumerate(range(given.first_step + 1, given.step + 1)):
+    for index, number in enumerate(range(given.common_step + 1, given.step + 1)):
         step = AdamStep(config, number, {group: rates[index] for group, rates in given.rates.items()})
         missed.add(step.scales)
     models, last = uploaded_groups(device, given.arrays), upload(device, given.last)
@@ -199,7 +199,7 @@ def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa:
         before = after[0].copy()
         for row in np.flatnonzero(taken):
             numbers = [number for number in range(given.last[row] + 1, given.step + 1) if number % every == 0]
-            due = [rates[number - given.first_step - 1] for number in numbers]
+            due = [rates[number - given.common_step - 1] for number in numbers]
             found = missed_steps(after[0][row], after[1][row], after[2][row], int(given.last[row]) // every, due)
             for array, values in zip(after, found, strict=True):
                 array[row] = values
@@ -233,7 +233,7 @@ def _random_noise(rng: Generator, count: int) -> Inputs:
     """Random Gaussians of nearly any opacity and shape, including needles and discs."""
     explore = Exploration(amount=10 ** rng.uniform(-3, 3), key=step_key(0, int(rng.integers(1 << 30))))
     logits = rng.uniform(-9, 0, count).astype(np.float32)
-    logits[0] = -7.0  # so faint that at least one Gaussian moves
+    logits[0] = -7.0  # the first Gaussian is so faint that the noise moves it
     return Inputs(
         explore=explore,
         quaternions=(rng.standard_normal((count, 4)) * 10 ** rng.uniform(-3, 3, (count, 1))).astype(np.float32),
