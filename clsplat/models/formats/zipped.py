@@ -41,12 +41,12 @@ ENCRYPTED_FLAG = 1
 
 def recognises(head: bytes) -> bool:
     """True if a file begins like a zip archive."""
-    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second is that of an archive without files
+    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # an archive without files begins with the second signature
 
 
 @dataclass(frozen=True)
 class ZipReader:
-    """Reads the model in a zip archive. These functions are passed in, since their module imports this one.
+    """Reads the model in a zip archive. The three functions are passed in, since their module imports this one.
 
     is_model_name(path): True if a file has the name of a model.
     has_gaussians(path, head): True if `head`, the first bytes of a file with a model's name, shows Gaussians.
@@ -93,7 +93,7 @@ class ZipReader:
 def unpacked(path: Path, reader: ZipReader) -> Iterator[Path]:
     """Context manager that unpacks the model to a temporary file and yields the file's path.
 
-    Warnings and errors about that file show the archive's name instead. Raises InputError if the archive is damaged,
+    Warnings and errors about the temporary file name the archive instead. Raises InputError if the archive is damaged,
     encrypted, too large unpacked, or does not contain exactly one model.
     """
     with ExitStack() as stack:
