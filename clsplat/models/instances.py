@@ -67,7 +67,7 @@ class Track(Protocol):
     """Placement of a model over time."""
 
     def at(self, frame: float) -> Placement:
-        """Placement at a frame, which may be fractional. Raises InputError if it is invalid."""
+        """Placement at a frame, which may be fractional. Raises InputError if the placement is invalid."""
 
     @property
     def reach(self) -> tuple[float, float] | None:

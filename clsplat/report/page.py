@@ -265,7 +265,7 @@ def _mask_words(use: MaskUse) -> list[str]:
 def _data(numbers: RunNumbers) -> dict[str, Any]:
     """Return the numbers of a run that its page embeds for other programs, without rounding.
 
-    The curves have about MAX_EMBEDDED_RECORDS points at most.
+    Long curves are reduced to about MAX_EMBEDDED_RECORDS points.
     """
     length = len(numbers.curves["step"])
     every = -(-length // MAX_EMBEDDED_RECORDS) or 1

@@ -25,7 +25,7 @@ from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture
 from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
 MAX_MODELS_ON_DEVICE = 2
-"""Maximum number of models on the device: the unchanged model of the file, and an edited one."""
+"""Maximum number of models on the device: of the file's model and its edited copies, those shown last."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
 """Floats per Gaussian of channels other than colour. The limit of a picture's size leaves device memory for them."""
 

@@ -239,8 +239,8 @@ def refused(headers: Any, *, local: bool) -> str:
     another port than the server, since a tunnel (ssh -L) may change it. A request without an Origin does not come from
     a page, and is accepted.
 
-    local: True if only this machine can reach the server. Then requests to other host names than localhost are
-        refused, against DNS rebinding.
+    local: True if only this machine can reach the server. Then requests to any host but localhost are refused, against
+        DNS rebinding.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:

@@ -93,8 +93,8 @@ def of_line(line: str) -> bool | None:
 class AntialiasStatements:
     """Statements about antialiasing in a file's header.
 
-    places: the header's texts, and for each True if it says that the model is antialiased, False if it denies it, and
-        None if it says neither.
+    places: pairs of a text in the header and its meaning: True if it says that the model is antialiased, False if it
+        denies it, None if it says neither.
     antialiased: True if the last statement says that the model is antialiased; False without statements.
     contradiction: warning, without the file's name, about statements that disagree; "" if all agree.
     not_understood: warning about the first text that mentions antialiasing but states nothing; "" if any text is a

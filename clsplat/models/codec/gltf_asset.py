@@ -126,7 +126,8 @@ class Asset:
                     count += 1
                     if count > MAX_GAUSSIAN_PRIMITIVES:
                         raise InputError(
-                            f"{self.path}: has more than {MAX_GAUSSIAN_PRIMITIVES} primitives of Gaussians"
+                            f"{self.path}: has more than {MAX_GAUSSIAN_PRIMITIVES} primitives of Gaussians, expected "
+                            "at most that many"
                         )
                     yield f"primitive {place} of node {index}", matrix, primitive
 

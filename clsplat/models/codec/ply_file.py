@@ -2,8 +2,8 @@
 """Reading of PLY files: the header, and the rows of the vertices.
 
 Format: http://paulbourke.net/dataformats/ply/. Comments that describe models are parsed with the header.
-Only clsplat writes ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT. Other programs, too, write comments about
-antialiasing.
+Only clsplat writes ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT. Other programs also write comments
+about antialiasing.
 """
 
 from __future__ import annotations

@@ -111,8 +111,8 @@ MODEL_FORMATS: tuple[Format, ...] = (
     Format("zipped model", (ZIP_SUFFIX,), _ZIPPED_MODEL.read, recognises=zipped.recognises,
            loses="clsplat does not write this format", describe=_ZIPPED_MODEL.describe, space=_ZIPPED_MODEL.space),
 )  # fmt: skip
-"""All formats. A file has the format of its suffix, unless its first bytes belong to others (`recognises`): then the
-first of them."""
+"""All formats. A file has the format of its suffix, unless its first bytes belong to other formats (`recognises`). Then
+it has the first of these formats."""
 
 
 def suffixes(*, writable: bool = False) -> list[str]:

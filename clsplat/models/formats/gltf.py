@@ -89,7 +89,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # as a list: too many primitives are an error before any is read
+    primitives = list(asset.primitives())  # a list, so that too many are an error before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -208,7 +208,9 @@ def write(
 
 
 def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
-    """Return for each attribute name, in the buffer's order, the function that computes the values, in glTF's axes.
+    """Return a function for each attribute, by the attribute's name and in the buffer's order.
+
+    Each function returns the attribute's values, in glTF's axes, for a slice of Gaussians.
 
     color_space: the model's colour space, one of GLTF_COLOR_SPACES.
     """

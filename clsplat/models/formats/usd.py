@@ -331,7 +331,7 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
 def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
     """Values (count, width) of the primvar `name` at USD's time code `time`; None if the primvar has no value.
 
-    A single value is repeated for all Gaussians. Raises InputError for any other number of values than `count`.
+    A single value is repeated for all Gaussians. Raises InputError if there are neither one nor `count` values.
     """
     attribute = prim.GetAttribute(name)
     value = attribute.Get(time) if attribute else None

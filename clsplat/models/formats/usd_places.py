@@ -151,7 +151,7 @@ class Instancer:
         return any(map(_varies, above)) or (self.outer is not None and self.outer.instancer.moves)
 
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
-        """Return USD's matrix from the prim of an instance's prototype to the world, and True if it is visible.
+        """Return an instance's USD matrix, from its prototype's own axes to the world, and True if it is visible.
 
         An instance that does not exist at this time is invisible. Its matrix is that of the last earlier time at which
         it exists, or if there is none, of the first later time. Raises InputError.
@@ -399,7 +399,7 @@ def _local(prim: Any, code: Any) -> Any:
 def _turn_of(matrix: Any, scales: Any) -> Any:
     """Return the rotation in USD's matrix of an instance that has these three scales.
 
-    Without the scales the matrix may still be sheared a bit. The result is the rotation nearest to it.
+    Without the scales, the matrix may still be sheared a bit. The result is the nearest rotation.
     """
     from pxr import Gf
 

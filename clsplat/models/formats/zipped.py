@@ -2,7 +2,7 @@
 """A .zip archive that contains one model: search for the model among the files, and unpacking.
 
 Format: https://pkware.cachefly.net/webdocs/casestudies/APPNOTE.TXT. Files added by Finder and Explorer (__MACOSX,
-hidden files) are ignored. If several files have a model's name, those whose first bytes show no Gaussians are ignored
+hidden files) are ignored. If several files have a model's suffix, those whose first bytes show no Gaussians are ignored
 too. All files in the model's folder of the archive are unpacked, since a model may have several.
 """
 
@@ -48,8 +48,8 @@ def recognises(head: bytes) -> bool:
 class ZipReader:
     """Reads the model in a zip archive. The three functions are passed in, since their module imports this one.
 
-    is_model_name(path): True if a file has the name of a model.
-    has_gaussians(path, head): True if `head`, the first bytes of a file with a model's name, shows Gaussians.
+    is_model_name(path): True if a path has the suffix of a model file.
+    has_gaussians(path, head): True if `head`, the first bytes of a file with such a suffix, shows Gaussians.
     resolve(path): the model's file and its `Format`.
     """
 
@@ -135,7 +135,7 @@ def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
 
 
 def _possible_models(archive: zipfile.ZipFile, reader: ZipReader) -> list[zipfile.ZipInfo]:
-    """Return the files that may be the model: all files with the name of a model format.
+    """Return the files that may be the model: all files with the suffix of a model format.
 
     If there are several, files whose first bytes show no Gaussians are left out, unless no file shows any.
     """
