@@ -117,7 +117,10 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
-    """Context manager that yields a binary file to write. At the end it is flushed to disk and renamed to `path`."""
+    """Context manager that yields a binary file to write. At the end it is flushed to disk and renamed to `path`.
+
+    needs: size of the file in bytes if it is known, as in `atomic_name`.
+    """
     # mode "x" instead of mkstemp, so that the file gets the permissions of the user's umask
     with atomic_name(path, needs) as temporary, open(temporary, "xb") as file:
         yield file
@@ -201,7 +204,7 @@ def scratch_folder(needs: int) -> Iterator[Path]:
     Raises WriteError if the disk has less than `needs` bytes, or becomes full while the library writes. If the library
     raises an exception of its own, a test file is written to find out whether the disk is full.
     """
-    # cleanup errors are ignored: the library may still have a file open, which Windows does not remove
+    # cleanup errors are ignored: Windows does not remove a file that the library still has open
     with tempfile.TemporaryDirectory(prefix="clsplat-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         try:
@@ -241,9 +244,9 @@ def replace(source: Path, target: Path) -> None:
 
 
 def move_into_place(work: Path, output: Path) -> None:
-    """Move the finished folder `work`/result to `output`. If that fails, the earlier folder at `output` is restored.
+    """Move the finished folder `work`/result to `output`, in place of an earlier folder.
 
-    Raises OSError.
+    If the move fails, the earlier folder is restored. Raises OSError.
     """
     earlier = work / "earlier"
     if output.exists():
@@ -262,7 +265,10 @@ def remove(path: Path) -> None:
 
 
 def _retry_on_windows(act: Callable[[], object], *, windows: bool = ON_WINDOWS) -> None:
-    """Call `act`. On Windows, repeat it for WINDOWS_RETRY_SECONDS while another program has the file open."""
+    """Call `act`. On Windows, repeat the call for WINDOWS_RETRY_SECONDS while another program has the file open.
+
+    windows: True to behave as on Windows.
+    """
     until = time.monotonic() + WINDOWS_RETRY_SECONDS
     while True:
         try:

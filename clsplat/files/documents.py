@@ -102,6 +102,7 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
 def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
     """The text of a UTF-8 file of at most `limit` bytes, without a byte order mark.
 
+    expected: text that follows "expected" in error messages.
     Raises InputError like `open_input`, and for a longer file or another encoding.
     """
     with open_input(path, expected) as file:

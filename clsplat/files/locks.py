@@ -53,8 +53,8 @@ def briefly_locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
 def claim(target: Path) -> Path | None:
     """Claim the file `target`, which this process is going to write.
 
-    Returns the marker file, which `give_back` removes; None if another process has the claim. The caller updates the
-    marker's modification time regularly. Other processes take over a stale claim, one that is ABANDONED_FILE_SECONDS
+    Returns the marker file, which `give_back` removes; None if another process has the claim. The caller has to update
+    the marker's modification time regularly. Other processes take over a claim whose marker is ABANDONED_FILE_SECONDS
     old, or whose process has ended. Raises OSError if the folder cannot be written.
     """
     path = _claim_of(target)

@@ -23,7 +23,7 @@ _WINDOWS_DEVICE_NAME = re.compile(
 def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
     """Reason why a file below a folder cannot have this name, as the end of a sentence; None if it can.
 
-    name: path relative to the folder, with forward slashes.
+    name: path relative to the folder, with forward slashes. windows: apply the rules of Windows.
     """
     pure: PurePath = PureWindowsPath(name) if windows else PurePosixPath(name)
     if pure.anchor or ".." in pure.parts:

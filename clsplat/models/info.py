@@ -79,7 +79,7 @@ def model_info(path: Path) -> dict[str, Any]:
 
 
 def size(path: Path, form: Format) -> int:
-    """Size in bytes of all files of a model."""
+    """Size in bytes of all files of a model. path: its main file."""
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 

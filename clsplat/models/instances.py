@@ -67,7 +67,7 @@ class Track(Protocol):
     """Placement of a model over time."""
 
     def at(self, frame: float) -> Placement:
-        """Placement at a frame, which may be fractional. Raises InputError if it is invalid."""
+        """Placement at a frame, which may be fractional. Raises InputError if the placement is invalid."""
 
     @property
     def reach(self) -> tuple[float, float] | None:
@@ -206,7 +206,8 @@ class Ensemble:
     def moved(self, state: State, after: State) -> Gaussians | None:
         """Merged model with the rows of `at(state)` and the means of the state `after`; None if no model moves.
 
-        Only its means are of use: SH coefficients above degree 0 are left out, and opacities are those of the models.
+        Only its means are of use. It has no SH coefficients above degree 0, and the placements' opacities and colours
+        are not applied.
         """
         if [(now.matrix, now.frame) for now in state] == [(then.matrix, then.frame) for then in after]:
             return None

@@ -36,8 +36,8 @@ class ModelSeries:
 
     Between two samples Gaussians are interpolated, means linearly, if each row is the same Gaussian in both; otherwise
     the nearer sample is used. Before the first sample the first is used, after the last sample the last. Unless `held`
-    is set, the means of that sample continue their motion: in a time t before the first sample they move as far as in
-    the time t after it, and in a time t after the last sample as far as in the time t before it.
+    is set, the means of that sample continue their motion: they move as far in a time t before the first sample as in
+    the time t after it, and as far in a time t after the last sample as in the time t before it.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ Points = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class ChartSeries:
-    """A series of a chart: points sorted by x, and the kind of their drawing.
+    """A series of a chart: points sorted by x, and `kind`, the way in which they are drawn.
 
     color: number of the colour, from 0 to SERIES_COLOUR_COUNT - 1.
     The kinds are:
@@ -83,7 +83,8 @@ def chart(
     x, y: labels of the axes.
     log_y: logarithmic y axis. Values that are not positive are left out.
     from_zero: the y axis includes zero.
-    powers: x values are exponents of ten.
+    powers: True if the x values are exponents of ten.
+    note: remark below the chart. Values replace it while the pointer is over the chart.
     """
     drawn = [replace(curve, points=_kept(curve, log_y)) for curve in series]
     drawn = [curve for curve in drawn if curve.points]

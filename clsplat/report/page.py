@@ -263,7 +263,10 @@ def _mask_words(use: MaskUse) -> list[str]:
 
 
 def _data(numbers: RunNumbers) -> dict[str, Any]:
-    """Return the run's numbers without rounding, which the page embeds for other programs."""
+    """Return the numbers of a run that its page embeds for other programs, without rounding.
+
+    Long curves are reduced to about MAX_EMBEDDED_RECORDS points.
+    """
     length = len(numbers.curves["step"])
     every = -(-length // MAX_EMBEDDED_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})

@@ -145,7 +145,10 @@ def number(value: object) -> float | None:
 
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """Yield the name of the flag and the value of each setting."""
+    """Yield the name of the flag and the value of each setting in the dataclass `config`.
+
+    prefix: text before the setting's name in a flag.
+    """
     for setting in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
         value, name = getattr(config, setting.name), prefix + setting.name.replace("_", "-")
         if is_dataclass(value):
@@ -174,7 +177,7 @@ def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
 
 
 def _evaluation(value: object) -> Record | None:
-    """Return the valid parts of an evaluation in the format of eval.json, or None if it is something else."""
+    """Return the valid parts of `value`, an evaluation in the format of eval.json; None for any other value."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []

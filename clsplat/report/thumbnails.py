@@ -122,6 +122,7 @@ def show(
     names: names of all held-out views.
     wanted: indices of the views to show.
     scene: the run's scene, for the photographs; None if there is no scene.
+    background: colour behind the transparent parts of photographs.
     side: maximum longer side of a picture in pixels.
     """
     try:

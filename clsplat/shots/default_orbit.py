@@ -2,7 +2,7 @@
 """Default cameras for a model without camera files: rings around the model, from its Gaussians' positions and sizes.
 
 If a run has recorded its photographs' cameras, a path can go among these cameras instead.
-The up axis: `shots/viewpoints.py`.
+`shots/viewpoints.py` has the default up axis.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Camera paths generated from a scene's cameras, with any number of frames: turntable, spiral and through.
 
-Default number of frames: `shots/read.py`. Up axis, and arcs that cameras cover: `shots/viewpoints.py`.
+`shots/viewpoints.py` finds the up axis and the arcs that cameras cover; `shots/read.py` has the default number of
+frames.
 """
 
 from __future__ import annotations
@@ -73,9 +74,9 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed path of `frames` cameras around the point that the scene's cameras look at, their focus point.
 
     The path keeps the cameras' median distance and height, and begins near the first camera. If the cameras surround
-    the focus point, the path makes one full turn. If they leave a wide gap, it swings back and forth over the arc that
-    they cover, since no camera has seen the rest. Intrinsics are the first camera's. Raises ValueError for no cameras
-    or no frames.
+    the focus point, the path makes one full turn. If they leave a wide gap, the path swings back and forth over the arc
+    that the cameras cover, since no camera has seen the rest. Intrinsics are the first camera's. Raises ValueError for
+    no cameras or no frames.
     """
     _check("turntable", cameras, frames)
     ring = _ring(cameras)
@@ -107,12 +108,13 @@ of hand-held photographs."""
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed path of two turns that rises and sinks over the cameras' range of heights, facing their focus point.
 
-    Coordinates are spherical about `focus_point`. If the cameras stand all around it, the path makes two full turns at
-    their median distance, while its elevation goes once from the 10th to the 90th percentile of theirs and back.
+    Coordinates are spherical about `focus_point`. If the cameras stand all around this point, the path makes two full
+    turns at the cameras' median distance. Its elevation goes once from the 10th to the 90th percentile of the cameras'
+    elevations and back.
 
-    If they leave a wide gap, the path is an ellipse in front of the scene, run through twice. In each round azimuth and
-    elevation go once to and fro over the arc and the percentiles that the cameras cover. The distance goes to and fro
-    once in the whole path, between the same percentiles.
+    If the cameras leave a wide gap, the path is an ellipse in front of the scene, run through twice. In each round, the
+    azimuth goes once to and fro over the arc that the cameras cover, and the elevation between the two percentiles. The
+    distance goes to and fro once in the whole path, between the 10th and 90th percentile of the cameras' distances.
 
     Intrinsics are the first camera's. Raises ValueError for no cameras or no frames.
     """

@@ -36,7 +36,7 @@ class Key:
 
 
 def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | None = None) -> list[Camera]:
-    """Interpolate cameras at `frames`. Before the first key and after the last, the camera stays at that key.
+    """Interpolate cameras at `frames`. Before the first key and after the last, the camera does not move.
 
     keys: key frames in increasing order of frame, with cameras of one size and projection.
     loop: number of frames after which the first key repeats; must exceed the span of the keys.

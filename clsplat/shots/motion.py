@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras for motion vectors (one frame later or earlier) and for motion blur (while the shutter is open).
 
-The time in which the shutter is open: `SamplingConfig.shutter` in `config/pictures.py`.
+`SamplingConfig.shutter` in `config/pictures.py` has the time in which the shutter is open.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, samplin
     between at which the shot's source has values. Returns None if the shot has no `moment`, or the shutter is (0, 0).
 
     resize: function that adapts a camera to the size of the pictures.
+    sampling: the times of the shutter and of its samples.
     """
     if shot.moment is None or sampling.shutter == (0.0, 0.0):
         return None
@@ -96,7 +97,8 @@ def targets(
     motion: True to return the next frame's camera; otherwise it is None. backward: the same for the previous frame.
     resize: function that adapts a camera to the size of the pictures.
     index: index of the frame in the shot.
-    middle: middle of the shutter, in frames. For a shot that has `moment`, the cameras are one frame from this time.
+    middle: middle of the shutter, in frames relative to the frame. A shot that has `moment` gives the cameras one frame
+        after and before this time. Other shots ignore `middle`.
     """
     if shot.moment is not None:
         time = shot.frames[index].number + middle

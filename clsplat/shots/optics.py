@@ -103,6 +103,6 @@ def time_code(number: int, rate: Fraction) -> int | None:
     minutes, second = divmod(seconds, 60)
     hours, minute = divmod(minutes, 60)
     code = 0
-    for value in (hours % 24, minute, second, frame):  # each takes two binary-coded decimal digits
+    for value in (hours % 24, minute, second, frame):  # each value takes two decimal digits of four bits
         code = code << 8 | value // 10 << 4 | value % 10
     return code

@@ -84,8 +84,9 @@ def choose_shot(
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
-    path: turntable, spiral or through, for `count` frames of a path generated from the cameras; None for the cameras
-      themselves.
+    path: turntable, spiral or through, for a path generated from the cameras; None for the cameras themselves.
+    count: number of frames of a generated path; None for DEFAULT_PATH_FRAMES.
+    size, usd_camera, lenses: as in `read_shot`.
     applied: names of the USD stage's settings that the caller applies itself, so that they need no warning.
     distort: use the photographs' own cameras, including the distortion of their lenses.
     Raises InputError.
@@ -114,9 +115,9 @@ def choose_shot(
 
 
 def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:
-    """Return the cameras of the frames without outliers, and a warning that names the outliers.
+    """Return the cameras of the frames except outliers, and a warning that names the outliers, if there are any.
 
-    source: file or folder of the cameras, for the warning. Without outliers there is no warning.
+    source: file or folder of the cameras, for the warning.
     """
     far = stray_cameras([frame.camera for frame in frames])
     near = [frame.camera for frame, stray in zip(frames, far, strict=True) if not stray]
@@ -130,6 +131,7 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
     """Read the photographs' cameras, with the distortion of their lenses, from a COLMAP model or a transforms.json.
 
+    size: width and height in pixels, for a transforms.json that gives no size; used only if both are given.
     Raises InputError like `read_shot`, for other sources of cameras, and for panoramas, which cannot be warped from a
     pinhole picture.
     """
@@ -172,6 +174,9 @@ def shot_around(
 
     The path goes among the photographs' cameras `own` if these are known and `up` is None. Otherwise it goes around the
     model, as in `cameras_around`. Raises InputError.
+
+    path: turntable, spiral or through; None is an error. count: number of frames; None for DEFAULT_PATH_FRAMES.
+    size: as in `among` or `cameras_around`. up: text of --up (`parse_up`); None for the default.
     """
     among_own = bool(own) and up is None
     path = check_around(path, among_own=among_own)
@@ -210,7 +215,7 @@ def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Fram
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
-        # a COLMAP model below colmap/ is nerfstudio's, whose transforms.json next to it has another world
+        # nerfstudio keeps a COLMAP model in colmap/, but trains in the world of its transforms.json
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:

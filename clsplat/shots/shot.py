@@ -49,8 +49,8 @@ class Shot:
     unapplied: names of the source's settings that are not applied to the frames.
     moment: function that returns the camera at a time in frames; None if the source only has cameras of frames.
     authored: times in frames at which the source has values, in increasing order.
-    reach: first and last time in frames at which the source has values for the camera's transform.
-    window: part of the frame that the source asks for, as in `usd_settings.Settings`.
+    reach: first and last time, in frames, of the source's values for the camera's transform; None if there are none.
+    window: part of the frame that a USD stage asks for, as in `usd_settings.Settings`; None for other sources.
     """
 
     frames: tuple[Frame, ...]

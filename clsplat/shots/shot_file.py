@@ -161,7 +161,7 @@ class Within:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """First and last frame at which either track is defined by its source, None if neither moves."""
+        """First and last frame for which the source of either track has data; None if both placements are static."""
         ends = [reach for track in (self.inner, self.outer) if (reach := track.reach)]
         return (min(first for first, _ in ends), max(last for _, last in ends)) if ends else None
 
@@ -175,6 +175,7 @@ class Volume:
     """A region of a model with its own matte, in the model's world: a box, a sphere, or the inside of a mesh.
 
     numbers: corners with the least and the largest coordinates of a box (6), or centre and radius of a sphere (4).
+      Empty for a mesh.
     """
 
     name: str

@@ -120,7 +120,7 @@ def read_here(path: Path) -> StageModels | None:
             elif place.instance is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
-        if any(isinstance(model, ModelSeries) for model in models):  # samples are read later
+        if any(isinstance(model, ModelSeries) for model in models):  # their samples are read later: digest the files
             for name in sorted(str(layer.realPath) for layer in layers):
                 sums.update(digest(Path(name)).encode() if name else b"")
         tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
@@ -136,6 +136,7 @@ def _model_of(path: Path, stage: Any, prim: Any, space: str) -> Gaussians | Mode
     """Return the Gaussians of a prim: a `ModelSeries` if they have time samples, otherwise a model.
 
     stage: the opened stage. The result keeps it open, since USD closes a stage with its last reference.
+    space: as in `gaussians_of`.
     """
     from pxr import Usd
 

@@ -25,7 +25,7 @@ from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture
 from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
 MAX_MODELS_ON_DEVICE = 2
-"""Maximum number of models on the device: the unchanged model of the file, and an edited one."""
+"""Maximum number of models on the device: of the file's model and its edited copies, those shown last."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
 """Floats per Gaussian of channels other than colour. The limit of a picture's size leaves device memory for them."""
 
@@ -44,7 +44,7 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """Model from a file. The device holds the unchanged model, and one with the edits of the last `Look`."""
+    """Model from a file. The device holds the model, and copies that are edited by a `Look`: the two shown last."""
 
     version = 0
     """Version number of the model. It is constant, as the model does not change."""
@@ -117,7 +117,10 @@ class LiveModel:
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """Render a picture. Returns it, and a remark for the page. Raises InputError if training leaves no memory."""
+        """Render a picture. Returns it, and a remark for the page. Raises InputError if training leaves no memory.
+
+        exact: not used, as all pictures are exact.
+        """
         trainer = self.trainer
         trainer.settle()
         degree = round(trainer.parameters.coefficients**0.5) - 1
@@ -146,7 +149,11 @@ def render_picture(
     background: Sequence[float],
     space: str,
 ) -> tuple[Image, str]:
-    """Render a picture of a model on the host or the device. Returns it, and a remark for the page."""
+    """Render a picture of a model on the host or the device. Returns it, and a remark for the page.
+
+    look: of its settings only the displayed channel is used, as the model is edited already.
+    space: the model's colour space.
+    """
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing remains of the model: the crop box contains no Gaussian")
     if look.mode in ("depth", "count"):

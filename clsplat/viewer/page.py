@@ -89,11 +89,11 @@ class ViserPage:
     def show(self, image: Image, level: Level, text: str) -> None:
         """Show a picture (H, W, 3), and as text its size, its exactness and the remark `text`.
 
-        level: exactness of the picture.
+        level: exactness of the picture, which also gives the JPEG quality.
         """
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
-        if self._shown == 2:  # create controls only after the first picture, because they keep a browser busy
+        if self._shown == 2:  # the controls come with the second picture, because they would delay the first
             self._build()
         height, width = image.shape[:2]
         self._say(
@@ -238,7 +238,7 @@ class ViserPage:
         def add() -> None:
             if (pose := self.viewer.pose) is not None:
                 add_key(self.keys, pose)
-                # lines are thin, because they lie along the page's edges as long as the camera stays at this pose
+                # thin lines, because they cover the page's edges as long as the camera stays at this pose
                 name = f"/keys/{len(self.keys) - 1}"
                 self._add_frustum(name, pose, "key", thickness=2.0, thickness_units="screen")
 
@@ -270,7 +270,7 @@ class ViserPage:
             button("Save path", lambda: self.tell(f"saved as {save_path(folder, document()).name}"))
 
     def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
-        """Draw a camera in the browser's scene. kind: key of CAMERA_COLOURS."""
+        """Draw a camera as the node `name` of the browser's scene. kind: key of CAMERA_COLOURS. options: viser's."""
         start = self.world.start
         return self.client.scene.add_camera_frustum(
             name,

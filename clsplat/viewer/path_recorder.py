@@ -48,7 +48,7 @@ class CameraFile(CameraFileHead):
 def add_key(keys: list[Pose], pose: Pose) -> None:
     """Append a key frame. Raises InputError if the path has MAX_KEY_FRAMES already."""
     if len(keys) >= MAX_KEY_FRAMES:
-        raise InputError(f"there are {MAX_KEY_FRAMES:,} key frames already")
+        raise InputError(f"there are {MAX_KEY_FRAMES:,} key frames already, expected fewer")
     keys.append(pose)
 
 
@@ -69,7 +69,7 @@ def path_document(
     """
     width, height = size
     if not keys:
-        raise InputError("no key frames are recorded yet")
+        raise InputError("no key frames are recorded yet, expected at least one")
     if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
         raise InputError(f"the size is {width}x{height}, expected 1 to {1 << 15} pixels per side")
     if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):

@@ -49,8 +49,8 @@ class Level:
 def next_scale(scale: float, seconds: float) -> float:
     """Return the scale (resolution) of a moving camera's next picture, after a picture of `scale` took `seconds`.
 
-    The scale changes in limited steps towards MOTION_PICTURE_SECONDS, because a part of the time does not depend on the
-    number of pixels.
+    The scale approaches, in limited steps, the one at which a picture takes MOTION_PICTURE_SECONDS. The steps are
+    limited because a part of the time does not depend on the number of pixels.
     """
     factor = math.sqrt(MOTION_PICTURE_SECONDS / max(seconds, 1e-4))
     return min(max(scale * min(max(factor, 0.6), 1.2), MIN_MOTION_SCALE), 1.0)

@@ -136,7 +136,7 @@ class Viewing:
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
         """Choose the viewer whose picture is due and who has waited longest. Returns None if no picture is due.
 
-        The result also has the picture's size and exactness.
+        The result also has the picture's size and exactness. version: the model's version number.
         """
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):

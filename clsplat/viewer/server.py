@@ -101,7 +101,8 @@ class Server:
         import viser
 
         self.viewing, self.world, self.address = viewing, world, address
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # after a page was closed
+        # viser warns about every message to a page that was closed
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
@@ -234,10 +235,12 @@ def _tell(_: Any, context: dict[str, Any]) -> None:
 def refused(headers: Any, *, local: bool) -> str:
     """Return the reason why a request is refused, or '' if it is accepted.
 
-    A request from a page of another server is refused: its origin and host differ in name or port.
-    Their port may differ from the server's, since a tunnel (ssh -L) may change it.
-    A server that only this machine can reach also refuses other host names, against DNS rebinding.
-    A request without an origin does not come from a page, and is accepted.
+    A request from a page of another server is refused: its Origin and Host differ in name or port. Both may have
+    another port than the server, since a tunnel (ssh -L) may change it. A request without an Origin does not come from
+    a page, and is accepted.
+
+    local: True if only this machine can reach the server. Then requests to any host but localhost are refused, against
+        DNS rebinding.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:

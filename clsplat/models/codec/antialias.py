@@ -91,8 +91,10 @@ def of_line(line: str) -> bool | None:
 
 
 class AntialiasStatements:
-    """Statements about antialiasing in a file's header, from its texts and what `of_line` returns for each.
+    """Statements about antialiasing in a file's header.
 
+    places: pairs of a text in the header and its meaning: True if it says that the model is antialiased, False if it
+        denies it, None if it says neither.
     antialiased: True if the last statement says that the model is antialiased; False without statements.
     contradiction: warning, without the file's name, about statements that disagree; "" if all agree.
     not_understood: warning about the first text that mentions antialiasing but states nothing; "" if any text is a
@@ -121,7 +123,7 @@ class AntialiasStatements:
 
     @property
     def warning(self) -> str:
-        """The warning, without the file's name; "" if there is none."""
+        """`contradiction`, or else `not_understood`; "" if both are empty."""
         return self.contradiction or self.not_understood
 
 

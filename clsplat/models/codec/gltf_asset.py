@@ -126,7 +126,8 @@ class Asset:
                     count += 1
                     if count > MAX_GAUSSIAN_PRIMITIVES:
                         raise InputError(
-                            f"{self.path}: has more than {MAX_GAUSSIAN_PRIMITIVES} primitives of Gaussians"
+                            f"{self.path}: has more than {MAX_GAUSSIAN_PRIMITIVES} primitives of Gaussians, expected "
+                            "at most that many"
                         )
                     yield f"primitive {place} of node {index}", matrix, primitive
 
@@ -216,7 +217,7 @@ class Asset:
         except ValueError:  # the URI has a zero byte, or an invalid address in brackets
             inside = False
         if not inside:
-            raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file beside it")
+            raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file in its folder or below it")
         with open_input(file, f"the buffer of {self.path}") as opened:
             size = os.fstat(opened.fileno()).st_size
         return _map(file, 0, size)
@@ -249,7 +250,7 @@ def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
 
 
 def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, int] | None]:
-    """JSON of a .glb, and the offset and length in bytes of its binary buffer, or None if it has no buffer."""
+    """JSON text of a .glb of `size` bytes, and offset and length in bytes of its buffer; None if it has no buffer."""
     head = file.read(16)
     if len(head) < 16:
         raise InputError(f"{path}: truncated: has {size} bytes, expected a .glb")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deterministic vector quantisation: codebooks of numbers and palettes of vectors.
 
-The number of entries: `models/formats/sog.py`.
+`models/formats/sog.py` sets the numbers of their entries.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDAr
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Return a palette (size, d) that approximates `vectors` (n, d), and the index (n,) in it of each vector's entry.
+    """Return a palette that approximates `vectors` (n, d), and for each vector the index (n,) of its palette entry.
+
+    The palette has shape (size, d), or (n, d) if there are fewer vectors than `size`.
 
     The method is k-means on two levels. The first level divides the vectors into clusters. The second divides each
     cluster further, and each part gives an entry of the palette. The larger a cluster and its squared error, the more
@@ -98,9 +100,10 @@ def palette(
 
 
 def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Divide `vectors` (n, d) into clusters. Returns their centres (size, d), and each vector's nearest centre (n,).
+    """Divide `vectors` (n, d) into clusters. Returns the centres, and the index (n,) of each vector's nearest centre.
 
-    The method is Lloyd's, with at most `iterations` iterations.
+    The method is Lloyd's, with at most `iterations` iterations. The centres have shape (size, d), or (1, d) if all
+    vectors are equal.
 
     If there are many vectors, the iterations use a sample of them. The initial centres lie along the direction of
     largest variance. A centre without vectors stays unchanged.
@@ -110,7 +113,7 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
             len(vectors), np.int64
         )
     middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
-    centred = vectors - middle  # because float32 is coarse far from 0
+    centred = vectors - middle  # float32 is more precise near 0
     sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
     centres = sample[order[((np.arange(size) + 0.5) / size * len(order)).astype(np.int64)]]

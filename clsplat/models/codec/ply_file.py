@@ -2,8 +2,8 @@
 """Reading of PLY files: the header, and the rows of the vertices.
 
 Format: http://paulbourke.net/dataformats/ply/. Comments that describe models are parsed with the header.
-Only clsplat writes ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT. Other programs, too, write comments about
-antialiasing.
+Only clsplat writes ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT. Other programs also write comments
+about antialiasing.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     for line in _header_lines(file, path):
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            given = numbers(words[3:])  # empty unless the words are numbers
+            given = numbers(words[3:])  # an empty array if the words are not numbers
             if words[:3] == ORIGIN_COMMENT:
                 origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE_COMMENT:
@@ -247,7 +247,7 @@ def _parse_row(words: list[bytes], where: str) -> list[float]:
 
 
 def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Yield the vertices of an ascii file in blocks of float64 columns."""
+    """Yield the vertices of an ascii file in blocks of float64 columns, like `read_vertices`."""
     path, vertex = header.path, header.vertex
     lines = _text_lines(file, path)
     # a value takes at least a character and a blank

@@ -85,7 +85,9 @@ def without_rotation(gaussians: Gaussians) -> NDArray[np.bool_]:
 
 
 def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
-    """Repair or leave out Gaussians with invalid values (see the module). Works in place unless some are left out.
+    """Repair or leave out Gaussians with invalid values (see the module).
+
+    Works in place, unless Gaussians are left out or `activated` is given.
 
     activated: the values that the file stores as opacities or scales; they are converted to logits or logs of scales.
         None means that the file stores logits and logs.
@@ -169,19 +171,20 @@ def _spread(opacities: Float32) -> bool:
     return reach or float((np.abs(opacities - 1) <= CLIPPED_OPACITY_SHARE[0]).mean()) >= CLIPPED_OPACITY_SHARE[1]
 
 
-def _white(logits: Float32) -> float:
-    """The stored value that stands for an opacity of 1.
+def _white(stored: Float32) -> float:
+    """Guess the number that stands for an opacity of 1 from all opacities (n,) as a file stores them.
 
     It is 100 for percentages, and 255 or a wider type's maximum for integer levels. Percentages and levels are whole
-    numbers, told apart by the largest of them (PERCENTAGE_MAXIMA). For all other values it is 1."""
+    numbers; the largest number tells which they are (PERCENTAGE_MAXIMA). For fractions and logits the result is 1.
+    """
     whole = (
-        logits.max() > LARGEST_USEFUL_LOGIT
-        and bool((logits == np.rint(logits)).all())
-        and len(np.unique(logits)) > MAX_HANDMADE_LOGITS
+        stored.max() > LARGEST_USEFUL_LOGIT
+        and bool((stored == np.rint(stored)).all())
+        and len(np.unique(stored)) > MAX_HANDMADE_LOGITS
     )
-    if whole and PERCENTAGE_MAXIMA[0] <= logits.max() <= PERCENTAGE_MAXIMA[1]:
+    if whole and PERCENTAGE_MAXIMA[0] <= stored.max() <= PERCENTAGE_MAXIMA[1]:
         return PERCENTAGE_MAXIMA[1]
-    return values.full_scale(logits) if whole else 1.0
+    return values.full_scale(stored) if whole else 1.0
 
 
 def _seen_scales(log_scales: Float32) -> str:

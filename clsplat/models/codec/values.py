@@ -48,7 +48,7 @@ GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a 
 
 
 def empty(count: int, degree: int) -> Gaussians:
-    """Uninitialised model of `count` Gaussians."""
+    """Uninitialised model of `count` Gaussians with SH coefficients up to `degree`."""
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3))
     arrays: list[Any] = [np.empty(shape, np.float32) for shape in shapes]
     return Gaussians(*arrays)
@@ -100,13 +100,13 @@ def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
 def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str = "") -> None:
     """Replace the linear scales (standard deviations) of all parts of a file by their logs, in place.
 
-    If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are taken for logs and
-    kept, with a warning. splat-transform wrote logs before 22 June 2026, and the review draft of
-    KHR_gaussian_splatting asked for them.
+    All scales are taken for logs and kept, with a warning, if `writer` is given, or if at least
+    LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale. splat-transform wrote logs before 22 June
+    2026, and the review draft of KHR_gaussian_splatting asked for them.
 
     parts: for each part of the file, a prefix for messages and the Gaussians.
     writer: name of the program that wrote the file, if it is known to write logs; otherwise "".
-    Raises InputError if some Gaussians have a negative scale, but less than that fraction of all.
+    Raises InputError if some Gaussians have a negative scale, but fewer than that fraction.
     """
     with np.errstate(invalid="ignore"):
         negative = [np.asarray((gaussians.log_scales < 0).any(axis=1)) for _, gaussians in parts]

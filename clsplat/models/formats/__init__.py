@@ -111,8 +111,8 @@ MODEL_FORMATS: tuple[Format, ...] = (
     Format("zipped model", (ZIP_SUFFIX,), _ZIPPED_MODEL.read, recognises=zipped.recognises,
            loses="clsplat does not write this format", describe=_ZIPPED_MODEL.describe, space=_ZIPPED_MODEL.space),
 )  # fmt: skip
-"""All formats. A file has the format of its suffix, unless its first bytes belong to others (`recognises`): then the
-first of them."""
+"""All formats. A file has the format of its suffix, unless its first bytes belong to other formats (`recognises`). Then
+it has the first of these formats."""
 
 
 def suffixes(*, writable: bool = False) -> list[str]:
@@ -149,11 +149,11 @@ def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> F
 def format_of(path: Path) -> Format:
     """Format of a file: the format of its name, unless the first bytes belong to another. Raises InputError."""
     named = _named(path)
-    if named is not None and path.is_dir():  # the reader checks if a folder is valid
+    if named is not None and path.is_dir():  # the format's reader checks the folder's contents
         return named
     with open_input(path, f"a model file with one of the suffixes {' '.join(suffixes())}") as file:
         head = file.read(FORMAT_HEAD_BYTES)
-        if head.startswith(b"ply") and b"end_header" not in head:  # long comments: read to the header's end
+        if head.startswith(b"ply") and b"end_header" not in head:  # long comments: read on, to the header's end
             head += file.read(MAX_PLY_HEADER_BYTES)
     # A format without a signature is recognised by the file's name, unless the file begins with another's signature.
     # The "{" with which JSON begins is no such signature: the first byte of any file may be a "{" by chance.
@@ -180,9 +180,9 @@ def _row(name: str) -> Format:
 
 
 def _has_mark(path: Path, head: bytes) -> bool:
-    """True if a file has the name of a model format, and its first bytes, `head`, contain one of the format's `marks`.
+    """True if a file has a model format's suffix, and its first bytes, `head`, contain one of the format's `marks`.
 
-    The name is enough if the format has no marks.
+    The suffix is enough if the format has no marks.
     """
     named = _named(path)
     return named is not None and (not named.marks or any(mark in head for mark in named.marks))

@@ -89,7 +89,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # a list: if there are too many, none is read
+    primitives = list(asset.primitives())  # a list, so that too many are an error before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -112,8 +112,10 @@ def _writer_of_logs(asset: Asset) -> str:
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[tuple[str, Gaussians]]) -> Gaussians:
     """Read the Gaussians of a primitive, in clsplat's axes.
 
-    If their scales are linear, `log_scales` holds them unchanged, and the Gaussians are appended to the list `scaled`
-    together with a prefix for messages. The caller then takes the logs.
+    Without SPZ compression a file has linear scales, which `log_scales` of the result still holds. Such Gaussians are
+    appended to the list `scaled`, with a prefix for messages, and the caller replaces their scales by logs.
+
+    name: the primitive's name, for messages.
     """
     said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", GLTF_COLOR_SPACES[0])
@@ -206,7 +208,12 @@ def write(
 
 
 def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
-    """Return a function for each attribute, by name and in the buffer's order: it returns values in glTF's axes."""
+    """Return a function for each attribute, by the attribute's name and in the buffer's order.
+
+    Each function returns the attribute's values, in glTF's axes, for a slice of Gaussians.
+
+    color_space: the model's colour space, one of GLTF_COLOR_SPACES.
+    """
 
     def rotation(rows: slice) -> Array:
         unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LUF_SIGNS)
@@ -253,7 +260,10 @@ class GaussianNode(TypedDict):
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """Build the JSON object of a glTF file, except the key `buffers`, and the contents of the file's only buffer."""
+    """Build the JSON object of a glTF file, except the key `buffers`, and the contents of the file's only buffer.
+
+    spz_compression, color_space: as in `write`.
+    """
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}

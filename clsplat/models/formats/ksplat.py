@@ -175,8 +175,8 @@ def _record(level: int, degree: int) -> np.dtype[Any]:
 def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArray[np.int64]:
     """Index of the first Gaussian after each bucket of a section. Full buckets come first.
 
-    head: the section's header. partial: numbers of Gaussians in the partly filled buckets.
-    Raises InputError if the buckets hold fewer Gaussians than the section has.
+    head: the section's header. partial: numbers of Gaussians in the partly filled buckets. name: prefix of errors.
+    Raises InputError for more buckets than the header states, or if the buckets hold too few Gaussians.
     """
     full = head["full"]
     if full + len(partial) > head["buckets"]:

@@ -77,8 +77,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     - Colours named as in RGB_PROPERTY_NAMES may replace f_dc. Their range is guessed (`values.full_scale`).
     - Other properties are ignored, MIP_FILTER_PROPERTY with a warning. Bytes after the data cause a warning too.
 
-    Raises InputError, one line with the path, if the file is missing, truncated, not a PLY, lacks a property or has no
-    Gaussians.
+    Raises InputError, a line that begins with the path, if the file is missing, truncated, not a PLY, lacks a property
+    or has no Gaussians.
     """
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
@@ -98,7 +98,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
-    """Read the values (n,) of an integer property of all Gaussians that `repair.repaired` does not leave out.
+    """Read the values (n,) of the integer property `name` for all Gaussians that `repair.repaired` does not leave out.
 
     Raises InputError like `read`, and if the property is missing or has values that are not 32-bit integers.
     """
@@ -211,7 +211,7 @@ def write_rows(
             block = np.zeros((len(some), len(names)), "<f4")
             block[:, 0:3] = some.means + model.origin if far else some.means
             block[:, 6:9] = some.sh[:, 0]
-            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view of the block
+            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view: the next line fills the block
             rest[:, :, :stored] = some.sh[:, 1:].transpose(0, 2, 1)
             block[:, -8] = some.opacity_logits
             block[:, -7:-4] = some.log_scales
@@ -248,8 +248,9 @@ def check_comments(comments: Sequence[str]) -> None:
 
 
 def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
-    """Read the exact means (n, 3) from the element LOCAL_MEANS_ELEMENT; None if it does not follow the vertices.
+    """Read the exact means (n, 3) from the element LOCAL_MEANS_ELEMENT.
 
+    Returns None if this element does not follow the vertices, and for an ascii file.
     Raises InputError if the file ends within the element.
     """
     wanted = Element(LOCAL_MEANS_ELEMENT, header.vertex.count, [(name, "f4") for name in POSITION_PROPERTIES])

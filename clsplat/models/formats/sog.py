@@ -130,7 +130,7 @@ def _names(folder: Path) -> list[str]:
 def _match_case(name: str, names: Iterable[str]) -> str:
     """Return the entry of `names` that equals `name` if case is ignored, as on Windows and macOS.
 
-    Returns `name` itself if it is an entry, and if not exactly one entry matches.
+    Returns `name` itself if it is an entry, or if no entry or more than one matches.
     """
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
@@ -148,7 +148,10 @@ def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
 
 
 def _beside(path: Path, name: str, _limit: int) -> Path:
-    """Find the file of the image `name` in the folder of the meta.json `path`. Raises InputError."""
+    """Find the file of the image `name` in the folder of the meta.json `path`. Raises InputError.
+
+    _limit: not used. It makes the function a `PictureFile`.
+    """
     folder = Path(os.path.realpath(path)).parent
     try:
         picture = Path(os.path.realpath(folder / name))
@@ -268,7 +271,7 @@ class _Meta:
                 raise InputError(f"{file}: does not decode: {one_line(reason)}")
         except InputError as error:
             before, unpacked, after = str(error).partition(plain(str(file)))
-            # the decoder's message may contain the file's name too
+            # the decoder's message may repeat the file's name
             named = f"{self.path}: {names[index][:80]}" + after.replace(unpacked, names[index][:80]) if unpacked else ""
             raise InputError(before + named) from None
         return np.asarray(decoded).reshape(spec.height, spec.width, -1)[:, :, :channels]
@@ -368,7 +371,7 @@ def write(
     InputError for non-finite values.
     """
     packing.check_writable(path, gaussians, least=1)
-    # An upper bound of the images' bytes is needed, because the WebP encoder crashes if the disk is full.
+    # the WebP encoder crashes if the disk is full, so the disk must have room for the largest possible images
     room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE_ENTRIES) + (1 << 16)
     with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)

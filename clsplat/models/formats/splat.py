@@ -59,7 +59,10 @@ def read(path: Path) -> Gaussians:
 
 
 def _check_first(block: Any, path: Path) -> None:
-    """Raise InputError if most of the records have an invalid rotation. The format has no header to check."""
+    """Raise InputError if most of a file's first records, `block`, have an invalid rotation.
+
+    The format has no header to check.
+    """
     lengths = np.linalg.norm(block["quaternions"].astype(np.float32) / 128 - 1, axis=1)
     if np.median(lengths) > 1 + UNIT_QUATERNION_TOLERANCE:
         raise InputError(f"{path}: not a .splat file (rotations of length {np.median(lengths):.2f}, expected 1)")

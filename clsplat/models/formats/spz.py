@@ -73,6 +73,7 @@ class SpzHeader:
 
     degree: SH degree.
     fractional_bits: number of bits after the binary point of a position.
+    flags: ANTIALIASED_FLAG and EXTENSIONS_FLAG, as bits.
     streams, table: number of Zstandard streams, and byte offset of their table; 0 before version 4.
     """
 
@@ -145,7 +146,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
 
 
 def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
-    """Read a file's header. Returns the header, and the stream with the attributes.
+    """Read the header of a file of `size` bytes. Returns the header, and the stream with the attributes.
 
     The stream is None in version 4, which has a stream for each attribute (`_zstd_streams`).
     """

@@ -162,7 +162,7 @@ def _open(path: Path) -> Any:
 
 
 def read(path: Path) -> Gaussians:
-    """Read all prims with Gaussians of a stage at its first time, merged into one model. Raises InputError."""
+    """Read all prims with Gaussians of a stage at its first time code, merged into one model. Raises InputError."""
     survive(path)
     return read_here(path)
 
@@ -247,7 +247,8 @@ def _space(attribute: Any, usual: str) -> str:
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
     """Read the values (count, width) of a prim's attribute `name`, or of its half-float variant, whose name ends in h.
 
-    where: prefix of errors. count: number of rows to return; None returns all rows.
+    where: prefix of errors. time: USD's time code.
+    count: number of rows to return; None returns all rows.
     Returns None if neither attribute has a value. Raises InputError for too few rows, or a wrong dtype or shape.
     """
     for key in (name, f"{name}h"):
@@ -266,7 +267,7 @@ def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int |
 
 
 def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussians:
-    """Gaussians of a prim, in the prim's own coordinates.
+    """Gaussians of a prim at USD's time code `time`, in the prim's own coordinates.
 
     space: colour space to which displayColor is converted if the prim has no SH.
     Raises InputError, prefixed with `where`.
@@ -294,7 +295,7 @@ def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussia
 
 
 def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
-    """SH coefficients (count, K, 3) of a prim."""
+    """SH coefficients (count, K, 3) of a prim with `count` Gaussians, at USD's time code `time`."""
     degree = prim.GetAttribute(SH_DEGREE_ATTRIBUTE).Get() if prim.GetAttribute(SH_DEGREE_ATTRIBUTE) else 3
     if not isinstance(degree, int) or not 0 <= degree <= 16:
         raise InputError(f"{where}: {SH_DEGREE_ATTRIBUTE} is {degree!r}, expected 0 to {MAX_SH_DEGREE}")
@@ -310,8 +311,9 @@ def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
 
 
 def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
-    """SH coefficients (count, 1, 3) of a prim without SH, from its displayColor in `space`; grey without displayColor.
+    """SH coefficients (count, 1, 3) of a prim without SH, from its displayColor; grey without displayColor.
 
+    time: USD's time code. space: colour space to which displayColor is converted.
     Raises InputError if the colours cannot be converted to that space.
     """
     colour = _primvar(where, prim, "primvars:displayColor", time, 3, count)
@@ -327,7 +329,10 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
 
 
 def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
-    """Values (count, width) of a primvar, with a value for each Gaussian or one for all; None if it has none."""
+    """Values (count, width) of the primvar `name` at USD's time code `time`; None if the primvar has no value.
+
+    A single value is repeated for all Gaussians. Raises InputError if there are neither one nor `count` values.
+    """
     attribute = prim.GetAttribute(name)
     value = attribute.Get(time) if attribute else None
     if value is None or not len(value):

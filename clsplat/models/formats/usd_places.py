@@ -151,10 +151,10 @@ class Instancer:
         return any(map(_varies, above)) or (self.outer is not None and self.outer.instancer.moves)
 
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
-        """Return an instance's matrix from the prototype's parent to the world, and True if it is visible.
+        """Return an instance's USD matrix, from its prototype's own axes to the world, and True if it is visible.
 
-        An instance that does not exist at this time is invisible. It has the matrix of the last time before at which it
-        existed, or if there is none, of the first time after. Raises InputError.
+        An instance that does not exist at this time is invisible. Its matrix is that of the last earlier time at which
+        it exists, or if there is none, of the first later time. Raises InputError.
 
         key: the instance's key. code: USD's time code.
         """
@@ -167,7 +167,7 @@ class Instancer:
         return self._at(_code(self._times[there]))[0][key], False
 
     def _at(self, code: Any) -> tuple[dict[Key, Any], frozenset[Key]]:
-        """Matrices of the instances by key, and the keys of hidden instances, at a time code. Cached."""
+        """Matrices of the instances by key, as in `of`, and the keys of hidden instances, at a time code. Cached."""
         time = code.GetValue()
         if time not in self._known:
             if len(self._known) >= _MAX_CACHED_TIMES:
@@ -191,7 +191,9 @@ class Instancer:
         return places, frozenset(hidden)
 
     def _own(self, code: Any) -> list[Any]:
-        """USD's matrices of the instances relative to the instancer. Empty if the instancer's arrays differ in length.
+        """USD's matrices of the instances relative to the instancer, at a time code.
+
+        The result is empty if the instancer's arrays differ in length.
 
         Rotations come from the quaternions, as for xformOp:orient. USD's ComputeInstanceTransformsAtTime shears if a
         quaternion's length is not exactly 1, as with half floats.
@@ -395,9 +397,9 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """Return the rotation of USD's matrix of an instance, from which the three scales are removed.
+    """Return the rotation in USD's matrix of an instance that has these three scales.
 
-    It is the rotation nearest to the matrix without scales, which may be sheared a bit.
+    Without the scales, the matrix may still be sheared a bit. The result is the nearest rotation.
     """
     from pxr import Gf
 

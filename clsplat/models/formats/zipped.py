@@ -2,7 +2,7 @@
 """A .zip archive that contains one model: search for the model among the files, and unpacking.
 
 Format: https://pkware.cachefly.net/webdocs/casestudies/APPNOTE.TXT. Files added by Finder and Explorer (__MACOSX,
-hidden files) are ignored. If several files have a model's name, those whose first bytes show no Gaussians are ignored
+hidden files) are ignored. If several files have a model's suffix, those whose first bytes show no Gaussians are ignored
 too. All files in the model's folder of the archive are unpacked, since a model may have several.
 """
 
@@ -41,15 +41,15 @@ ENCRYPTED_FLAG = 1
 
 def recognises(head: bytes) -> bool:
     """True if a file begins like a zip archive."""
-    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second is that of an archive without files
+    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # an archive without files begins with the second signature
 
 
 @dataclass(frozen=True)
 class ZipReader:
-    """Reads the model in a zip archive. These functions are passed in, since their module imports this one.
+    """Reads the model in a zip archive. The three functions are passed in, since their module imports this one.
 
-    is_model_name(path): True if a file has the name of a model.
-    has_gaussians(path, head): True if `head`, the first bytes of a file with a model's name, shows Gaussians.
+    is_model_name(path): True if a path has the suffix of a model file.
+    has_gaussians(path, head): True if `head`, the first bytes of a file with such a suffix, shows Gaussians.
     resolve(path): the model's file and its `Format`.
     """
 
@@ -93,7 +93,7 @@ class ZipReader:
 def unpacked(path: Path, reader: ZipReader) -> Iterator[Path]:
     """Context manager that unpacks the model to a temporary file and yields the file's path.
 
-    Warnings and errors about that file show the archive's name instead. Raises InputError if the archive is damaged,
+    Warnings and errors about the temporary file name the archive instead. Raises InputError if the archive is damaged,
     encrypted, too large unpacked, or does not contain exactly one model.
     """
     with ExitStack() as stack:
@@ -135,7 +135,7 @@ def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
 
 
 def _possible_models(archive: zipfile.ZipFile, reader: ZipReader) -> list[zipfile.ZipInfo]:
-    """Return the files that may be the model: all files with the name of a model format.
+    """Return the files that may be the model: all files with the suffix of a model format.
 
     If there are several, files whose first bytes show no Gaussians are left out, unless no file shows any.
     """

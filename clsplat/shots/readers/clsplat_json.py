@@ -87,7 +87,8 @@ def _frame(keys: Keys, fps: float | None, first: float) -> float:
         return keys.require("frame")
     if fps is None:
         raise InputError(f"{keys.where}: has 'seconds', but the file has no 'fps', expected frames per second")
-    return round(first + keys.require("seconds") * fps, 6)  # rounded, so that 0.1 s at 30 fps is frame 3
+    # rounded, because 2.2 s at 25 fps would be 55.00000000000001 frames
+    return round(first + keys.require("seconds") * fps, 6)
 
 
 def _frames(path: Path, frames: list[float], loop: float | None) -> list[int]:

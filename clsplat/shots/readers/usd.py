@@ -56,7 +56,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     """Read cameras like `read_usd`, from a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
-    # captures the messages that USD would print. They may not concern the camera, as for a missing layer.
+    # captures USD's messages, which become warnings: some, such as that of a missing layer, do not concern the camera
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     stage = open_stage(path, path)
     with readable(path):

@@ -75,7 +75,10 @@ def window_named(window: tuple[float, float, float, float] | None) -> tuple[str,
 
 
 def camera_of_settings(stage: Any) -> str:
-    """Return the camera's path that a render product gives, or else the stage's render settings; '' if neither does."""
+    """Return the path of the camera that a render product names; if none does, that of the stage's render settings.
+
+    The result is '' if neither names a camera.
+    """
     settings = _stage_settings(stage)
     for prim in (*_products(settings), settings) if settings else ():
         if targets := prim.GetCameraRel().GetForwardedTargets():
@@ -127,7 +130,7 @@ def _stage_settings(stage: Any) -> Any:
 
 
 def _unnamed(stage: Any) -> tuple[str, ...]:
-    """Return a text for a warning on each RenderSettings prim, at most three, if the stage's metadata name none."""
+    """Return texts for a warning on up to three RenderSettings prims, for a stage whose metadata name none of them."""
     from pxr import UsdRender
 
     paths = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
