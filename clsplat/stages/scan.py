@@ -49,7 +49,7 @@ class Elements:
 def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
     """Return the number of groups that share n elements, and the number of elements in each group's chunk.
 
-    items: work-items of a group, if different from the kernel shape.
+    items: number of work-items of a group; 0 for the number in the kernel shape.
     """
     items = items or device.shape.items
     if items == 1:
