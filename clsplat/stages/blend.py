@@ -85,7 +85,7 @@ class Blended:
     image: (3, rows, stride).
     transmittance: (rows, stride).
     stops: (rows, stride) int32, the sorted index of the first pair that is not added to the pixel; -1 in padding.
-    cells_from_sorted: (pairs) uint32, a bit for each cell in which the pair's Gaussian contributes; None if not recorded.
+    cells_from_sorted: (pairs) uint32, a bit for each cell in which the pair contributes; None if not recorded.
     nearness: (rows, stride), the sum of weight / depth, if requested.
     parts: the boundaries within the lists of the last band; None if they are not recorded.
     """
