@@ -152,7 +152,7 @@ class PictureBorders:
 def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
     """Return True (B,) for chunks that a picture may show; False only if no Gaussian of a chunk reaches a tile.
 
-    Chunks whose bounds are not finite are visible. Gaussians that are added to a chunk must be inside its bounds.
+    Chunks whose bounds are not finite are visible. The bounds must also hold for Gaussians that were added to a chunk.
     """
     if not picture.culls or len(bounds) == 0:
         return np.ones(len(bounds), np.bool_)

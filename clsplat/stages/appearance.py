@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches the kernels of colour models, which remove a photograph's own colours, and of their update (appearance.cl).
+"""Launches the kernels of colour models and of their update by Adam (appearance.cl).
 
-To add a colour model, add a row to COLOUR_MODELS (config/colour_models.py), and a kernel file and a twin with its name.
+A colour model removes a photograph's own colours. To add a colour model, add a row to COLOUR_MODELS
+(config/colour_models.py), and a kernel file and a twin with the model's name.
 """
 
 from __future__ import annotations

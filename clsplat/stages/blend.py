@@ -23,8 +23,8 @@ BLEND_PIXEL_BYTES = 20
 
 
 PART_PAIRS = 512
-"""Number of pairs of a list that a group of several items walks in the gradient of blending. A longer list is divided
-between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
+"""Number of pairs of a list that one group of several items processes in the gradient of blending. A longer list is
+divided between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
 
 
 def gradient_pair_bytes(device: Device, fields: SlotFields) -> int:
@@ -177,7 +177,7 @@ def launch_tiles(
     kernel: the kernel's name, if it is not `stem`.
     items: number of work-items that share a tile; None for `tile_items`.
     registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
-    more: number of further groups.
+    more: number of groups in addition to those of the tiles.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """

@@ -127,7 +127,7 @@ class ChunkPool:
 
         changes: True if the device will change the chunks.
 
-        Raises ValueError for more chunks than slots, WriteError, and ScratchError. After an error all chunks are
+        Raises WriteError and ScratchError, and ValueError for more chunks than slots. After an error all chunks are
         unchanged, on the device and in the store.
         """
         moves = self._residency.plan(numbers)

@@ -183,7 +183,7 @@ class Screen:
     """Screen-space results of one view. Only the rows of visible Gaussians are written.
 
     gradients: (n, 2), with respect to the means on the image, in pixels.
-    contributions: (n,), sums of the blending weights over the image's pixels, or None.
+    contributions: (n,), sums of the blending weights over the image's pixels; None if not requested.
     """
 
     gradients: DeviceArray
