@@ -27,7 +27,7 @@ Movement = Callable[[NDArray[np.integer]], Float64]
 
 
 class BoundsTable:
-    """Bounds of a model's chunks as they were last measured, and the most by which Gaussians have moved since.
+    """Bounds of a model's chunks as they were last measured, and the most by which Gaussians may have moved since.
 
     The bounds of a group enclose the bounds of its chunks. They are NaN if a chunk's bounds are not finite.
 
@@ -49,16 +49,16 @@ class BoundsTable:
         changed = numbers.astype(np.int64)
         for below, level in pairwise(self._levels):
             changed = np.unique(changed // GROUP)
-            members = below[np.minimum(_members(changed), len(below) - 1)]  # the last group repeats its last member
+            members = below[np.minimum(_members(changed), len(below) - 1)]  # a short last group repeats its last member
             sides = np.hstack([members[:, :, :3].min(axis=1), members[:, :, 3:].max(axis=1)])
             with np.errstate(invalid="ignore"):
                 finite = np.isfinite(members.sum(axis=(1, 2)))
             level[changed] = np.where(finite[:, None], sides, np.nan)
 
     def move(self, numbers: NDArray[np.uint32], steps: Float64) -> None:
-        """Record that a training step has moved the Gaussians of the chunks `numbers` (n,).
+        """Record how far training steps may have moved the Gaussians of the chunks `numbers` (n,).
 
-        steps: (2, n or 1), the largest change of a mean's coordinate in the step, and of a log scale.
+        steps: (2, n or 1), the largest change of a mean's coordinate, and of a log scale.
         """
         self._moved[:, numbers] += steps
         self._most_moved = np.maximum(self._most_moved, self._moved[:, numbers].max(axis=1, initial=0.0, keepdims=True))
@@ -67,7 +67,7 @@ class BoundsTable:
         """Return the numbers of the chunks for which `sees` is True, rising. Only chunks of groups in view are tested.
 
         sees: function that tells which bounds are in view.
-        hidden: function that returns the changes of chunks that `move` has not recorded.
+        hidden: function that returns the largest changes in steps that chunks missed. `move` has not recorded these.
         most_hidden: (2, 1), the largest of these changes in any chunk.
         updates: number of updates of a parameter since the oldest measurement (`ChunkBounds.widened`).
         """

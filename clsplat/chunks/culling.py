@@ -152,7 +152,7 @@ class PictureBorders:
 def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
     """Return True (B,) for chunks that a picture may show; False only if no Gaussian of a chunk reaches a tile.
 
-    Chunks whose bounds are not finite are visible. Gaussians that are added to a chunk must be inside its bounds.
+    Chunks whose bounds are not finite are visible. The bounds must also hold for Gaussians that were added to a chunk.
     """
     if not picture.culls or len(bounds) == 0:
         return np.ones(len(bounds), np.bool_)
@@ -227,7 +227,7 @@ def _out_of_depth(cones: _Cones, picture: PictureBorders) -> Bool:
 
 
 def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64, Float64]:
-    """Return two half angles (B,), in radians: of the largest cone that contains a Gaussian, and of the whole chunk's.
+    """Return two half angles (B,), in radians: of the largest cone around a Gaussian, and of the whole chunk's cone.
 
     A Gaussian's cone is around the direction of its mean. By equations (12) and (13) of docs/cameras.md, the Gaussian's
     ellipse lies in the plane that touches the unit sphere at this direction; a ray at an angle to the direction reaches
@@ -309,8 +309,8 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     The kernels bound a Gaussian by a rectangle in the picture, whose sides are along and across the direction from the
     axis to the mean. The rectangle reaches from radius `inner` to `outer`, and `aside` to both sides. If a Gaussian may
     contain the axis, or reach the largest angle, the kernels take a square around the axis. The bound here is then
-    1.5 `outer` on all sides, which no corner of a Gaussian's rectangle exceeds. A rectangle never reaches beyond 2
-    `outer`, which is less than the bound of a group of chunks, 2.25 `outer`.
+    1.5 `outer` on all sides, which no corner of a Gaussian's rectangle exceeds. For a group of chunks it is 2.25
+    `outer`, more than the bound by a chunk's rectangle, which is at most 2 `outer`.
     """
     camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
     widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))

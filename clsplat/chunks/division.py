@@ -87,8 +87,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
 
 
 def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return two arrays with an element for each old chunk: the number of new rows from the chunk, and
-    True if these rows differ from the chunk's old rows. entries, starts: as in `divided`."""
+    """Return two arrays with an element for each old chunk: the number of rows that come from the chunk, and True if
+    they differ from the chunk's old rows. entries, starts: as in `divided`."""
     lengths = np.diff(starts)
     counts, stay, before = np.zeros_like(lengths), np.zeros_like(lengths), -1
     for begin in range(0, len(entries), _COUNTED_ROWS):

@@ -67,14 +67,16 @@ def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) ->
     if (record := state.get(MANIFEST_KEY)) is None:
         return None
     if not isinstance(record, dict) or not set(MANIFEST_ARRAYS) <= arrays.keys():
-        raise ValueError("its list of chunks is incomplete")
+        parts = f"an object {MANIFEST_KEY!r} in its state, and the arrays {', '.join(MANIFEST_ARRAYS)}"
+        raise ValueError(f"its list of chunks is incomplete: expected {parts}")
     lengths, slots, checksums, constants = (arrays[key] for key in MANIFEST_ARRAYS)
     file, slot_bytes, fields = record.get("file"), record.get("slot_bytes"), record.get("fields")
     if not isinstance(file, str) or type(slot_bytes) is not int or record.get("rows") != CHUNK_ROWS:
         found = f"file {file!r:.80}, slot_bytes {slot_bytes!r:.80} and rows {record.get('rows')!r:.80}"
         raise ValueError(f"its list of chunks has {found}, expected a path, a whole number and {CHUNK_ROWS}")
     if not isinstance(fields, dict) or len(fields) > _MOST_FIELDS or not all(map(_is_shape, fields.values())):
-        raise ValueError("the fields of its chunks are not as this version writes them")
+        limits = f"at most {_MOST_FIELDS} shapes of at most {_MOST_FLOATS} elements"
+        raise ValueError(f"the fields of its chunks are damaged: expected {limits}")
     shapes = {name: tuple(shape) for name, shape in fields.items()}
     filled = sum(0 not in shape for shape in shapes.values())
     least, most = _record_bytes(shapes), _MOST_FIELDS * _MOST_FLOATS * 4 * CHUNK_ROWS
@@ -96,7 +98,8 @@ def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) ->
     if slots.min() < -1 or len(np.unique(written)) < len(written):
         raise ValueError("two of its chunks are in the same slot, or a slot number is below -1")
     if constants.max(initial=WRITTEN) > INFINITE or (constants[slots < 0] == WRITTEN).any():
-        raise ValueError("its list of chunks has constants that are not as this version writes them")
+        codes = f"0 to {INFINITE}, and not {WRITTEN} for a chunk without a slot"
+        raise ValueError(f"its list of chunks has unknown codes of constants: expected {codes}")
     return Manifest(Path(file), slot_bytes, shapes, lengths, slots, checksums, constants)
 
 

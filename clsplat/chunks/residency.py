@@ -82,7 +82,7 @@ class Residency:
         return numbers, self._slot_of[numbers].astype(np.uint32)
 
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """Return the slot of each chunk; -1 if it is not on the device."""
+        """Return the slots of the chunks `numbers`; -1 for a chunk that is not on the device."""
         slots: NDArray[np.int64] = self._slot_of[numbers]
         return slots
 

@@ -180,9 +180,9 @@ class SlotFile:
         self.moved(values.nbytes, time.perf_counter() - start)
 
     def _runs(self, slots: NDArray[np.int64], nbytes: int) -> Iterator[tuple[int, int, int]]:
-        """Yield (index, slot, length) as `runs` does, for records of `nbytes` bytes to read or write at once.
+        """Yield (index, slot, length), as `runs` does, of each run of records that can be read or written at once.
 
-        Records that are shorter than a slot are yielded one by one.
+        nbytes: size of a record. If it is smaller than a slot, the records are yielded one by one.
         """
         for place, slot, length in runs(slots):
             step = length if nbytes == self.slot_bytes else 1

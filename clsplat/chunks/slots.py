@@ -23,7 +23,7 @@ class SlotTable:
     """Table of the slots of a model's chunks in a file of `size` slots.
 
     A slot that a kept checkpoint names (`hold`) is not overwritten: when its chunk is written next, the chunk goes to a
-    free slot. The lowest free slots are taken first. The file grows only when no slot is free.
+    free slot. The lowest free slots are taken first. The file grows only when too few slots are free.
 
     current: (chunks,) int64, the slot of each chunk of the model; NO_SLOT if it has not been written.
     """

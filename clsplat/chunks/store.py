@@ -2,8 +2,8 @@
 """Store of a streamed model's chunks, in main memory or in a scratch file.
 
 A record has all fields of CHUNK_ROWS rows, one field after the other, so that a chunk moves by one read or write. In a
-file each field of a record has a checksum, so that a file that was cut or changed never gives a wrong row. A chunk that
-a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md). If a
+file each field has a checksum, so that a file that was cut or changed never gives a wrong row. A slot that a kept
+checkpoint names is not overwritten; its chunk goes to another slot (docs/decisions/0052-a-store-of-chunks.md). If a
 field has the same value in all elements of a chunk, only a code for this value is stored (`manifest.CONSTANTS`).
 """
 
@@ -125,13 +125,13 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Size in bytes: in main memory of the records of all rows, in a scratch file of one slot for each chunk."""
+        """Size in bytes of the records of all rows in main memory, or of a slot for each chunk in a scratch file."""
         if self.path is None:
             return self.count * self.record.itemsize // CHUNK_ROWS
         return self.chunks * self.file.slot_bytes
 
     def close(self) -> None:
-        """Free the store's memory, close its file, and remove the file unless a checkpoint names slots of it."""
+        """Free the memory, and close the file. A writable file is removed unless a checkpoint names slots of it."""
         self._memory.clear()
         if self.path is None or self.file.closed:
             return
@@ -260,7 +260,7 @@ class ChunkStore:
         return rows
 
     def set_records(self, start: int, stop: int, rows: NDArray[Any]) -> None:
-        """Replace the rows [start, stop). rows: records as of `get_records`. Raises WriteError and ScratchError."""
+        """Replace the rows [start, stop). rows: records as from `get_records`. Raises WriteError and ScratchError."""
         numbers, mine, evenly = self._covering(start, stop)
         records = rows
         if not evenly:
@@ -473,7 +473,7 @@ def _checksums(records: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDArray[Any]:
-    """Return an array of this shape: for each chunk that `to` keeps its row of `values`, for other chunks zeros."""
+    """Return an array of this shape: the row of `values` for each chunk that `to` keeps, zeros for other chunks."""
     carried, stays = np.zeros(shape, values.dtype), to.kept != NEW
     if stays.any():
         carried[stays] = values[to.kept[stays]]

@@ -39,7 +39,8 @@ It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 r
 """
 
 CHUNK_ROWS = 1024
-"""Chunk size: number of consecutive rows of a model in a chunk; the last chunk may have fewer."""
+"""Chunk size: number of consecutive rows of a model in a chunk. The last chunk may have fewer rows, and in a streamed
+model any chunk."""
 
 POSE_ROWS = 64
 """Number of Gaussians whose terms of a pose gradient one work-item adds in sequence, to a partial sum."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour models: a vignette's distances, the pull of gains to initial values, and Adam's update of the entries.
+"""Colour models: distances from the principal point, the pull of gains to initial values, and Adam's update.
 
 Float64 twin of kernels/appearance.cl and kernels/shared/develop.h.
 """

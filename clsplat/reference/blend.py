@@ -18,7 +18,7 @@ from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Footprint, Seen
 BLEND_ALPHA_MAX = float(np.float32(0.99))
 """Largest alpha of a Gaussian at a pixel."""
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
-"""A pixel ends before the Gaussian that would leave it this transmittance or less.
+"""Blending of a pixel ends before the Gaussian that would reduce its transmittance to this or less.
 
 This limit and the largest alpha are rounded to float32 as in the kernels. Unrounded, two Gaussians of alpha 0.99 would
 leave exactly 1e-4."""

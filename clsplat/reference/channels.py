@@ -21,7 +21,7 @@ from clsplat.reference.render import parameters
 
 @dataclass(frozen=True, eq=False)
 class ChannelsTwin:
-    """Channels of a frame: eqs. (60) to (67). In pixels without Gaussians, index is -1 and the others are 0.
+    """Channels of a frame: eqs. (60) to (67). In pixels without Gaussians, index is -1, doubt infinite, and the rest 0.
 
     features: the blended features by channel, (H, W) or (H, W, 2 to 3).
     median: (H, W), depth at which the transmittance falls to one half.

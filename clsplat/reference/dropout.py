@@ -25,7 +25,10 @@ def factors(thinning: Thinning, count: int, first_row: int = 0) -> Float64:
 
 
 def thinned_logits(opacity_logits: Float64, by: Float64) -> Float64:
-    """Return the logits (n,) of products of opacities and `by` (n,), all below 1; -700 for a product of 0."""
+    """Return the logits (n,) of opacities times the factors `by` (n,); -700 where a factor is 0.
+
+    The products must be below 1.
+    """
     opacities = by / (1 + np.exp(-opacity_logits))
     logits: Float64 = np.where(by > 0, np.log(np.maximum(opacities, 1e-300)) - np.log1p(-opacities), -700.0)
     return logits

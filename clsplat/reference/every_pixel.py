@@ -83,7 +83,7 @@ def render_grad(
 ) -> GradientsTwin:
     """Return the gradients of a loss with respect to the Gaussians, for a camera of any projection.
 
-    For camera models along rays, `means2d` holds gradients per pixel along the axes of the tangent plane.
+    For camera models along rays, `means2d` and `abs_means2d` are per pixel, not per radian as in `BlendGradients`.
 
     d_image: (H, W, 3), gradient of the loss with respect to the image.
     d_nearness: (H, W), gradient with respect to the nearness; None for 0.

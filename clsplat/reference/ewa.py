@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """EWA projection with gsplat's conventions, and its gradient: float64 twin of kernels/ewa.cl and kernels/ewa_grad.cl.
 
-Equation numbers refer to docs/gradients.md. The gradient with respect to the view matrix is with respect to its upper
-twelve entries, which need not be a rotation and a translation.
+Equation numbers refer to docs/gradients.md. In gradients, the upper twelve entries of the view matrix are independent
+variables, which need not be a rotation and a translation.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class EwaViewTwin:
 
 @dataclass(frozen=True, eq=False)
 class EwaProjectedTwin:
-    """Projected Gaussians. Of culled Gaussians only the radii are 0.
+    """Projected Gaussians. Culled Gaussians have radii of 0; their other values are not set to 0.
 
     radii: (N, 2) int32, half sides of the bounding box in pixels, 0 where culled.
     means2d: (N, 2), pixels.
@@ -267,7 +267,7 @@ def _pinhole_grad(
     The gradient with respect to the principal point is only the part through means that are clamped in the Jacobian,
     with the sign reversed.
 
-    points, jacobians, clamped: rows of `EwaProjectedTwin`.
+    points, jacobians, clamped: rows of these arrays of `EwaProjectedTwin`.
     d_means2d, d_j: gradients (N, 2) and (N, 2, 3) with respect to the means on the image and the Jacobians.
     """
     z = points[:, 2]

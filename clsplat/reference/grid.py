@@ -20,7 +20,7 @@ def identity(shape: tuple[int, int, int]) -> Float64:
 
 
 def _hats(places: Float64, count: int) -> Float64:
-    """Return weights (..., count) of the vertices on an axis of a grid, to interpolate at coordinates (...)."""
+    """Return linear interpolation weights (..., count) of the vertices on an axis, at coordinates `places` (...)."""
     weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
     return weights
 
@@ -42,7 +42,10 @@ def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, 
 
 
 def _maps(down: Float64, along: Float64, levels: Float64, grid: Float64) -> Float64:
-    """Interpolate a grid to the pixels: (H, W, 3, 4). One axis after the other, as NumPy finds no such order itself."""
+    """Interpolate a grid to the pixels: (H, W, 3, 4). down, along, levels: weights from `_weights`.
+
+    Sums over one axis at a time, because a single call of `np.einsum` would do far more work.
+    """
     rows = np.tensordot(down, grid, axes=(1, 1))  # (H, levels, columns, 3, 4)
     pixels = np.tensordot(rows, along, axes=(2, 1))  # (H, levels, 3, 4, W)
     maps: Float64 = np.einsum("yxl,ylabx->yxab", levels, pixels)

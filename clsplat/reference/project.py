@@ -44,7 +44,7 @@ class Footprint:
 
     box: slices of the picture's rows and columns.
     dx, dy: broadcastable to (h, w), pixel centre minus mean; for camera models along rays, on the tangent plane.
-    falloff: (h, w), exp(-q / 2).
+    falloff: (h, w), exp(-q / 2), with q as in `Seen.conic`.
     raw: (h, w), opacity times falloff: alpha before it is limited to 0.99.
     """
 
@@ -283,8 +283,7 @@ def compensation(det0: Float64, det: Float64) -> Float64:
 
 
 def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
-    """Return the parts (N, 2, 2) of the gradients with respect to both covariances that come from the compensation: eq.
-    (84).
+    """Return the gradients (N, 2, 2) with respect to `plain` and `filtered` through the compensation alone: eq. (84).
 
     plain, filtered: (N, 2, 2), the covariances without and with the low-pass.
     d_logs: (N,), gradient of the loss with respect to ln(opacity).

@@ -86,7 +86,7 @@ def render(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
 ) -> tuple[Float64, Float64]:
-    """Render a model to an image (H, W, 3) over the background, and alpha (H, W)."""
+    """Render a model to an image (H, W, 3) over the background, and alpha (H, W). sh_degree: as for `forward`."""
     blended = forward(gaussians, camera, background, sh_degree).blended
     return blended.image, 1 - blended.transmittance
 
@@ -103,6 +103,7 @@ def render_grad(
     """Return the gradients of a loss with respect to the Gaussians of a rendered picture.
 
     d_image: (H, W, 3), gradient of the loss with respect to the image.
+    sh_degree: as for `forward`.
     d_transmittance: (H, W), gradient with respect to the transmittance behind all Gaussians; None for 0.
     d_nearness: (H, W), gradient with respect to the nearness; None for 0.
     """

@@ -20,7 +20,7 @@ class Splats:
     """Ellipses of projected Gaussians. Rows of culled Gaussians are 0.
 
     whitenings: (n, 3), w11, w12, w22 of W, where W^T W is the conic.
-    half_extents: (n, 2), of the bounding box of the ellipse where alpha is 1/255.
+    half_extents: (n, 2), in pixels, of the bounding box of the ellipse where alpha is 1/255.
     drawn: (n,), False for culled Gaussians.
     """
 

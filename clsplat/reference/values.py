@@ -118,7 +118,10 @@ def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float)
 def blend_values(
     gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = BLEND_ALPHA_MAX
 ) -> ValuesBlended:
-    """Blend the Gaussians' values to a picture over the background (D,): eq. (177)."""
+    """Blend the Gaussians' values to a picture over the background (D,): eq. (177).
+
+    alpha_max: largest alpha of a Gaussian at a pixel.
+    """
     image = np.zeros((height, width, gaussians.values.shape[1]))
     left, margin = np.ones((height, width)), np.full((height, width), MAX_VALUES_MARGIN)
     for layer in _layers(gaussians, width, height, alpha_max):
@@ -141,6 +144,7 @@ def blend_values_grad(
 
     d_image: (H, W, D), gradient of the loss with respect to the image.
     d_alpha: (H, W), gradient with respect to the image's alpha, 1 - transmittance.
+    alpha_max: as for `blend_values`.
     """
     layers = list(_layers(gaussians, width, height, alpha_max))
     n, depth = gaussians.values.shape

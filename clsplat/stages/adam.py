@@ -40,13 +40,13 @@ class AdamStep:
         shrunk, root = self.corrections(self.number if group != "sh_rest" else self.number // self.config.sh_rest_every)
         return self.rates[group] / shrunk, root
 
-    def corrections(self, updates: int) -> tuple[float, float]:
-        """Return 1 - beta1^t and 1 / sqrt(1 - beta2^t), where t is `updates`, the number of an update from 1."""
-        return 1.0 - self.config.beta1**updates, (1.0 - self.config.beta2**updates) ** -0.5
+    def corrections(self, update: int) -> tuple[float, float]:
+        """Return 1 - beta1^t and 1 / sqrt(1 - beta2^t) for a group's update number t = `update`, counted from 1."""
+        return 1.0 - self.config.beta1**update, (1.0 - self.config.beta2**update) ** -0.5
 
     @property
     def scales(self) -> dict[str, float]:
-        """Step size, rate sqrt(1 - beta2^t) / (1 - beta1^t), of each parameter group that the step updates, by name."""
+        """Step sizes by parameter group that the step updates: rate * sqrt(1 - beta2^t) / (1 - beta1^t)."""
         groups = [group for group in self.rates if group != "sh_rest" or self.updates_sh_rest]
         by_group = {group: self.corrected(group) for group in groups}
         return {group: rate / root for group, (rate, root) in by_group.items()}
@@ -65,9 +65,10 @@ def adam(
 ) -> None:
     """Update the parameters by Adam, and set the gradients to zero.
 
+    first, second: Adam's moments.
     tile_counts: (n,) uint32, 0 for a Gaussian that the view does not show; needed if `OptimiserConfig.late` is set.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the elements that were not updated, by reason
-    (`columns.REFUSED`).
+    (`columns.REFUSED`). None discards these counts.
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
     counts = readback.buffer  # a plain buffer: the profile must not count readback's bytes, which are rarely written

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches the kernels of colour models, which remove a photograph's own colours, and of their update (appearance.cl).
+"""Launches the kernels of colour models and of their update by Adam (appearance.cl).
 
-To add a colour model, add a row to COLOUR_MODELS (config/colour_models.py), and a kernel file and a twin of that name.
+A colour model removes a photograph's own colours. To add a colour model, add a row to COLOUR_MODELS
+(config/colour_models.py), and a kernel file and a twin with the model's name.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ class Gains:
 
 
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
-    """Upload the arrays `begins`, `others` and `weights` of `Gains` for the sparse matrix `pull`; None means zero."""
+    """Upload the arrays `begins`, `others` and `weights` of `Gains` for the sparse matrix `pull`; None for zeros."""
     from scipy.sparse import csr_array
 
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
@@ -153,10 +154,11 @@ def entry_gradient(
 ) -> DeviceArray:
     """Return the loss's gradient with respect to colour entries, summed over each pixel column: (model.sums, stride).
 
-    For the gradient, the entries count as 0, and as applied to the render instead of removed from the photograph. The
-    sum over the columns, times ln 2 for logarithms, is given by equations (184) to (186) of docs/gradients.md.
+    It is the gradient at entries of 0 that are applied to the render, instead of removed from the photograph. Equations
+    (184) to (186) of docs/gradients.md give the sum over the columns, times ln 2 for logarithms.
 
     image, gradient: (3, rows, stride), the render and the gradient with respect to it.
+    size: width and height in pixels.
     place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
@@ -187,6 +189,7 @@ def step_gains(
     photograph: the photograph or lens of the view, a row of `gains`. All other rows have a gradient of 0.
     columns: the result of `entry_gradient`, which contains the gradient with respect to this row.
     step: the number of this update, from 1.
+    rate: learning rate of the gains.
     readback: counts of the step's pass (`READBACK`). Nothing changes if the pass has stopped (kernels/duplicate.cl).
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape

@@ -23,12 +23,12 @@ BLEND_PIXEL_BYTES = 20
 
 
 PART_PAIRS = 512
-"""Number of pairs of a list that a group of several items walks in the gradient of blending. A longer list is divided
-between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
+"""Number of pairs of a list that one group of several items processes in the gradient of blending. A longer list is
+divided between groups (kernels/shared/parts.h). Must be a multiple of every BATCH of blend.cl."""
 
 
 def gradient_pair_bytes(device: Device, fields: SlotFields) -> int:
-    """Bytes per pair that the gradient of blending needs: the pair's slot, and its cells or its share of a state."""
+    """Bytes per pair in the gradient of blending: its slot, and its cells or its share of the arrays of `ListParts`."""
     cells, state = 4, 4 * (4 + fields.nearness) * TILE * TILE + 4
     return 4 * fields.floats + (cells if tile_items(device) == 1 else -(-state // PART_PAIRS))
 
@@ -52,7 +52,7 @@ class ListParts:
 
     @property
     def arguments(self) -> tuple[Any, Any]:
-        """Kernel arguments. They are buffers, so that a stage's bytes leave them out: few of theirs are used."""
+        """Kernel arguments, as plain buffers: the profile must not count their bytes, of which few are used."""
         return self.states.buffer, self.tile_of_state.buffer
 
     @property
@@ -85,9 +85,9 @@ class Blended:
     image: (3, rows, stride).
     transmittance: (rows, stride).
     stops: (rows, stride) int32, the sorted index of the first pair that is not added to the pixel; -1 in padding.
-    cells_from_sorted: (pairs) uint32, the cells in which each pair's Gaussian contributes, as bits; or None.
+    cells_from_sorted: (pairs) uint32, a bit for each cell in which the pair contributes; None if not recorded.
     nearness: (rows, stride), the sum of weight / depth, if requested.
-    parts: the boundaries within the lists of the last band, or None.
+    parts: the boundaries within the lists of the last band; None if they are not recorded.
     """
 
     image: DeviceArray
@@ -129,8 +129,8 @@ def frame_items(device: Device, tiles: int) -> int:
     """Number of work-items that share a tile in `blend` and `sort_lists`, in a frame of `tiles` tiles. No result
     depends on this number.
 
-    A frame with few tiles for a GPU's units waits for its longest lists. More work-items sort a long list in less time,
-    and more warps blend it in shorter parts.
+    With few tiles per compute unit of a GPU, a frame takes as long as its longest lists. More work-items sort a long
+    list in less time, and each warp then blends fewer of its Gaussians.
     """
     items = tile_items(device)
     if device.kind != "gpu" or items == 1:
@@ -141,7 +141,8 @@ def frame_items(device: Device, tiles: int) -> int:
 def items_for(tiles: int, units: int, items: int, most: int) -> int:
     """Return the number of work-items that share a tile on a GPU, for `frame_items`.
 
-    The result is `items` times a power of two: the largest of at most `most` that the compute units can use.
+    The result is `items` times a power of two: the largest that is at most `most`, and with which a compute unit has at
+    most _BUSY_ITEMS work-items.
 
     tiles: number of tiles of the frame.
     units: number of the GPU's compute units.
@@ -176,7 +177,7 @@ def launch_tiles(
     kernel: the kernel's name, if it is not `stem`.
     items: number of work-items that share a tile; None for `tile_items`.
     registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
-    more: number of further groups.
+    more: number of groups in addition to those of the tiles.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
@@ -186,17 +187,17 @@ def launch_tiles(
 
 
 def _divides(device: Device) -> bool:
-    """True if groups of the gradient share long lists."""
+    """True if several work-groups of `blend_grad` share a long list (`ListParts`)."""
     return tile_items(device) > 1 and not _by_gaussian(device)
 
 
 def _by_gaussian(device: Device) -> bool:
-    """True if each item of the gradient's groups owns Gaussians."""
+    """True if each work-item of `blend_grad` owns Gaussians instead of pixels."""
     return device.shape.by_gaussian and not device.switched("RAYS")
 
 
 def _rays(device: Device, inputs: ImageInputs) -> DeviceArray | None:
-    """The camera, if Gaussians are evaluated along the rays of pixels."""
+    """The camera if Gaussians are evaluated along the rays of pixels, otherwise None."""
     return inputs.camera_array if device.switched("RAYS") else None
 
 
@@ -266,7 +267,7 @@ def count_pairs(
     vector computes the alpha of all its lanes.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # the arrays of `blend`; they keep their values
+    planes = _planes(work, width, height, kept=True)  # the arrays of `blend`, which get the same values again
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
@@ -277,7 +278,7 @@ def count_pairs(
 def _divided(
     device: Device, work: Workspace, lists: TileLists, inputs: ImageInputs, blended: Blended, *, nearness: bool
 ) -> Blended:
-    """Blend the tiles of the lists again, for the parts of the lists. They were not kept, or belong to another band."""
+    """Blend the tiles again to record `Blended.parts`, which `blend` does not record in a frame of several bands."""
     near = blended.nearness
     if nearness and near is None:
         near = work.array("nearness", blended.transmittance.shape)

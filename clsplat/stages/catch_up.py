@@ -73,7 +73,7 @@ def catch_up(
     last: (k,) uint32, for each of the k entries of `chunks` the last step that updated the chunk with its gradients.
     caught: (chunks of the model,) uint32, the step up to which each chunk has caught up. The call writes `step` for
     the listed chunks, so that a second call for the same step changes nothing.
-    table: the numbers of consecutive steps, which must include all missed steps.
+    table: constants of consecutive steps, which must include all missed steps.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the refused updates; an element counts once for each
         step that refuses it.
     """

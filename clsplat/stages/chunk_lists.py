@@ -58,8 +58,8 @@ def send_chunks(
     model_rows: int,
     first_rows: NDArray[np.integer[Any]] | None = None,
 ) -> ChunkList:
-    """Upload a padded list of chunks to the workspace's array `name`, and the chunks' first rows to another array,
-    without waiting for the device."""
+    """Upload a padded list of chunks to the workspace's array `name`, and the chunks' first rows, if given, to another
+    array, without waiting for the device."""
     padded = padded_chunks(numbers)
     array, first = work.array(name, padded.shape, np.uint32), None
     array.send(padded)

@@ -123,11 +123,11 @@ class ChunkPool:
         return CHUNK_ROWS * self.slots
 
     def place(self, numbers: NDArray[np.integer[Any]], *, changes: bool) -> NDArray[np.uint32]:
-        """Fetch chunks that are not on the device yet. Returns the slot of each chunk.
+        """Bring the chunks `numbers` (k,) to the device, unless they are there already. Returns their slots (k,).
 
         changes: True if the device will change the chunks.
 
-        Raises ValueError for more chunks than slots, WriteError, and ScratchError. After an error all chunks are
+        Raises WriteError and ScratchError, and ValueError for more chunks than slots. After an error all chunks are
         unchanged, on the device and in the store.
         """
         moves = self._residency.plan(numbers)
@@ -157,15 +157,18 @@ class ChunkPool:
     def place_rows(self, start: int, stop: int) -> None:
         """Copy the rows [start, stop) of the model to the first rows of the pool. They need not be whole chunks.
 
-        So the pool does not know the rows as chunks, and only `keep_rows` can write changes of them back. Raises
-        WriteError and ScratchError.
+        The pool does not record which chunks these rows belong to, so only `keep_rows` can write their changes back.
+        Raises WriteError and ScratchError.
         """
         self.release()
         for begin, end, slots in self._row_groups(start, stop):
             self._to_slots(slots, self.store.get_records(begin, end))
 
     def keep_rows(self, start: int, stop: int) -> None:
-        """Write the rows that `place_rows` has copied back to the store. Raises WriteError and ScratchError."""
+        """Write the rows [start, stop), which `place_rows` has copied to the pool, back to the store.
+
+        Raises WriteError and ScratchError.
+        """
         for begin, end, slots in self._row_groups(start, stop):
             self.store.set_records(begin, end, self._from_slots(slots))
 
@@ -203,7 +206,7 @@ class ChunkPool:
         self.store.rename(names)
 
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """Return the slot of each chunk; -1 if it is not on the device."""
+        """Return the slots of the chunks `numbers`; -1 for a chunk that is not on the device."""
         return self._residency.slots_of(numbers)
 
     def _exchange_caught(
@@ -221,12 +224,12 @@ class ChunkPool:
     def _fetch(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
         for some in self._groups(len(numbers)):
             values = self.store.read(numbers[some])
-            self._close(numbers[some], values)
+            self._pad(numbers[some], values)
             self._to_slots(slots[some], values)
 
-    def _close(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Pad the records of chunks to CHUNK_ROWS rows, by copies of each chunk's last row. The copies' opacity is
-        so low that no view shows them, and their moments are 0, so that no step moves them."""
+    def _pad(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
+        """Pad the records of the chunks `numbers` to CHUNK_ROWS rows, by copies of each chunk's last row. The copies'
+        opacity is so low that no view shows them, and their moments are 0, so that no step moves them."""
         lengths = self.store.lengths(numbers)
         for place in np.flatnonzero(lengths < CHUNK_ROWS).tolist():
             rows = int(lengths[place])

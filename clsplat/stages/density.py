@@ -80,10 +80,11 @@ class DensityStatistics:
     seen: number of views that show the Gaussian.
     radii: largest radius in pixels.
 
-    CONTRIBUTION_STATISTICS are sums of blending weights in the images of the training views, in pixels. They are kept
-    by epoch, whether or not Gaussians are densified. `totals` is the sum over the views, `largest` the maximum over the
-    views; `current` is the current epoch, `whole` the last complete epoch. They are infinite for a Gaussian that was
-    not measured in some view of the epoch, for example a new one. They are None if no rule uses them.
+    CONTRIBUTION_STATISTICS are sums of blending weights in the images of the training views, in pixels. They belong to
+    an epoch, which has each view once, and do not start again when Gaussians are densified. `totals` is the sum over
+    the views, `largest` the maximum over the views; `current` is the current epoch, `whole` the last complete epoch.
+    They are infinite for a Gaussian that was not measured in some view of the epoch, for example a new one. They are
+    None if no rule uses them.
 
     of_slots: True if the arrays are a pool's, with the rows of its slots.
     """
@@ -337,8 +338,8 @@ def _listed(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, 
 
 
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
-    """Try the kernels of `gather` on existing arrays. Call it only inside `launch.only_tried`: a real launch would
-    overwrite the arrays."""
+    """Try the kernel of `gather` for `count` rows, with an array of `source` as input and output. Call it only inside
+    `launch.only_tried`: a real launch would overwrite the array."""
     if isinstance(source, DeviceGaussians):
         array = source["opacity_logits"]
         _gather_array(device, array.reshaped(min(count, source.count)), array, array, None)

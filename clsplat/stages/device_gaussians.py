@@ -322,8 +322,9 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
     """Return the parameters, first and second moments in a checkpoint's store. Raises ValueError if the store's records
     have other arrays than `fields_of` returns."""
     coefficients = store.fields.get("parameters/sh_rest", (0,))[0] + 1
-    if {name: shape for name, shape in store.fields.items() if name.split("/")[0] in KINDS} != fields_of(coefficients):
-        raise ValueError("its chunks have other fields than this version's")
+    fields = {name: shape for name, shape in store.fields.items() if name.split("/")[0] in KINDS}
+    if others := sorted({name for name, _ in fields.items() ^ fields_of(coefficients).items()}):
+        raise ValueError(f"the fields of its chunks differ from the fields of this version: {', '.join(others):.200}")
     return [
         HostGaussians(
             store.count,

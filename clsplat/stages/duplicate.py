@@ -35,8 +35,8 @@ BAND_TILE_BYTES = 4
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Return the bytes per pair of its tile, slot and Gaussian. With `sorts_pairs` the bytes for `duplicate_and_sort`
-    are added: tile, Gaussian and depth by slot, and a sort of the pairs by depth."""
+    """Return the bytes per pair: its tile, slot and Gaussian. `sorts_pairs` adds the bytes of `duplicate_and_sort`:
+    tile, Gaussian and depth by slot, and a sort of the pairs by depth."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
 
@@ -184,7 +184,10 @@ def count_by_capacity(
 def _compact(
     device: Device, work: Workspace, projected: Projected, readback: DeviceArray, capacity: int | None = None
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Fill `readback`, and return the first slots (n), the visible Gaussians (n) and their depth keys (n)."""
+    """Fill `readback`, and return the first slots (n), the visible Gaussians (n) and their depth keys (n).
+
+    capacity: maximum number of pairs in a pass by capacity; None for other passes.
+    """
     tile_counts = projected.tile_counts
     (n,) = tile_counts.shape
     shown = projected.shown or tile_counts

@@ -16,7 +16,7 @@ from clsplat.device.profile import stage
 from clsplat.stages.appearance import APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON
 
 GRID_SHAPE = (8, 16, 16, 3, 4)
-"""Size of a bilateral grid: levels, rows and columns, then the shape of the colour transform in each cell."""
+"""Size of a bilateral grid: levels, rows and columns, then the shape of the colour transform at each vertex."""
 GRID_FLOATS = int(np.prod(GRID_SHAPE))
 
 
@@ -41,9 +41,10 @@ def _spans(width: int, height: int) -> tuple[float, float]:
 
 
 def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
-    """Bytes per pixel, padding included: the planes of the transformed image, and a share of the fixed arrays.
+    """Bytes per pixel, padding included: the planes of the transformed image, and a share of the other arrays.
 
-    The fixed arrays are the grids, their moments, and the line sums for the largest of the `sizes` (width, height).
+    These are the grids and their moments, the gradient with respect to a grid, and the sums of the gradient along each
+    image row, for the largest of the `sizes` (width, height).
     """
     lines = max((height for _, height in sizes), default=0) * GRID_SHAPE[2] * 12 * GRID_SHAPE[0]
     held = 4 * (3 * GRID_FLOATS * photographs + GRID_FLOATS + lines)

@@ -107,9 +107,10 @@ def harmonics_grad(
     add_directions: bool = False,
     by_centre: bool = False,
 ) -> DeviceArray | None:
-    """Compute the gradients with respect to coefficients and directions from d_colours (n, 3), those of the colours.
+    """Compute the gradients with respect to coefficients and directions.
 
     given, colours: the inputs and the result of `harmonics`.
+    d_colours: (n, 3), the gradient with respect to `colours`.
     gradients: filled with the results.
     add: True adds the gradients with respect to coefficients to the values that `gradients` has from earlier cameras.
     add_directions: True does so for the gradients with respect to directions or means.

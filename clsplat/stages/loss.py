@@ -31,9 +31,9 @@ class _Blocks:
     """Blocks of pixels that groups of the loss kernel process.
 
     rows, columns: size of a block in pixels.
-    groups: number of groups. In groups of several items, which process one block each, it is a tuple: the numbers of
-        blocks across, of blocks down, and of channels.
-    field: number of floats in a row of one of SSIM's three partial derivatives; 0 in groups of several items.
+    groups: number of groups; for groups of several items, which process one block each, a tuple of the numbers of
+        blocks across, blocks down and channels.
+    field: number of floats in a row of one of SSIM's three partial derivatives; not used for groups of several items.
     partials: number of floats in the array of partial derivatives.
     sums: number of floats in the array of the loss's partial sums.
 
@@ -79,6 +79,7 @@ class Loss:
     sums: (3, ...), partial sums of SSIM, of |x - y| and of (x - y)^2, where x is the render and y the target. With
     further terms the array has one axis, and the partial sums of these terms follow.
     samples: number of colour samples, three per pixel, that no mask excludes.
+    weight: weight of 1 - SSIM; L1 has the weight 1 - weight.
     masked: number of masked samples. The mean of SSIM still includes the windows around them.
     copy: function that waits for a copy of the sums to the host and returns it; None if no copy has been started.
     further: weight, divisor and number of partial sums of each loss term other than L1 and D-SSIM.
@@ -93,8 +94,8 @@ class Loss:
     further: tuple[tuple[float, float, int], ...] = ()
 
     def fetched(self) -> Loss:
-        """Start a copy of the sums to the host, and return the loss with this copy. Its `read` does not wait for
-        launches that follow."""
+        """Start a copy of the sums to the host, and return the loss with this copy. Then `read` does not wait for
+        later launches."""
         return self.copied(self.sums.begin_get())
 
     def copied(self, copy: Callable[[], NDArray[Any]]) -> Loss:
@@ -135,8 +136,8 @@ def loss(
     target: planes like the image's; or a photograph (height, width, 3), uint8 or float32, if several items share a
     tile (`tile_items`).
     sums_index: index of the array for the loss's sums. A call's sums can be read until the next call with this index.
-    kept: number of pixels that no mask excludes, over which the means are taken. Excluded pixels are zero in both
-        images.
+    kept: number of pixels that no mask excludes, over which the means are taken; None for all pixels. Excluded pixels
+        are zero in both images.
     blended: the render; needed only if there are terms.
     terms: loss terms to add. Each has a plane of the gradient, after the colours, and its own partial sums.
     """

@@ -49,7 +49,7 @@ class LossTerm:
 
     @property
     def key(self) -> object:
-        """Settings that the launch depends on. A command buffer replays the launch only if they are equal. None
+        """Settings that the launch depends on. A command buffer replays the launch only if they have not changed. None
         prevents replays."""
         return None
 
@@ -109,7 +109,7 @@ class DepthTerm(LossTerm):
         return self.factor, 1.0
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Upload the known depths, and launch depth_loss.cl."""
+        """Upload the known nearness and its weights, and launch depth_loss.cl."""
         blended, (_, rows, stride) = compared.blended, compared.gradient.shape
         assert blended.nearness is not None, "the depth loss needs an image blended with nearness"
         aims = compared.work.array("depth_aims", (2, rows, stride))

@@ -52,7 +52,7 @@ def noise(
 def _add_noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
-    """Launch add_noise. This is a function of its own so that a step without noise records no stage `noise`."""
+    """Launch add_noise. A separate function, so that the profile of a step without noise has no stage `noise`."""
     *words, amount = noise_numbers(explore)
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(

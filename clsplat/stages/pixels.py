@@ -13,9 +13,9 @@ from clsplat.stages.device_camera import padded_size
 
 @stage("pixels")
 def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, alpha: DeviceArray) -> None:
-    """Copy the image of `blended` to pixels (height, width, depth), and its alpha to alpha (height, width).
+    """Copy the image of `blended` to pixels (height, width, D), and its alpha to alpha (height, width).
 
-    Each pixel gets min(depth, 3) colour values. With a depth over 3, its other values are not written.
+    The first min(D, 3) values of each pixel are set to its colour, and the others are not written.
     """
     height, width, depth = pixels.shape
     kernel, stride = device.kernels("pixels").pixels_from_planes, blended.transmittance.shape[1]
@@ -29,7 +29,7 @@ def planes_from_pixels(
 ) -> DeviceArray:
     """Return the image gradient (3, rows, stride) for `blend_grad`, from the gradient with respect to pixels.
 
-    d_pixels: (height, width, depth), depth 1 to 3.
+    d_pixels: (height, width, D), with 1 to 3 values per pixel. Planes without a value are zero.
     d_alpha: (height, width), the gradient with respect to alpha. With it the result has a fourth plane, the gradient
     with respect to the transmittance.
 

@@ -37,6 +37,7 @@ def pose_rows(
 
     device: the device with the kernel switches of the camera model.
     gaussians: all Gaussians of the model, or consecutive rows of it.
+    tile_counts: their tile counts in the view. Gaussians with a count of 0 are left out.
     gradients: the gradients with respect to the parameters of these Gaussians.
     sums: (ceil(rows of the model / POSE_ROWS), 6), of which the rows of these Gaussians are filled.
     first_row: the model's row that is the first of `gaussians`, a multiple of POSE_ROWS.
@@ -63,7 +64,7 @@ def lens_rows(
     """Compute the gradient with respect to a camera's lens, as a partial sum for every POSE_ROWS Gaussians.
 
     by_lens: (n, LENS_NUMBERS), the gradients of n Gaussians from `project_grad`.
-    sums, first_row: as in `pose_rows`, with LENS_NUMBERS columns.
+    tile_counts, sums, first_row: as in `pose_rows`, with LENS_NUMBERS columns.
     """
     (n,) = tile_counts.shape
     kernel = device.kernels("pose", {"LANES": 1}).lens_rows

@@ -183,7 +183,7 @@ class Screen:
     """Screen-space results of one view. Only the rows of visible Gaussians are written.
 
     gradients: (n, 2), with respect to the means on the image, in pixels.
-    contributions: (n,), sums of the blending weights over the image's pixels, or None.
+    contributions: (n,), sums of the blending weights over the image's pixels; None if not requested.
     """
 
     gradients: DeviceArray
@@ -255,10 +255,11 @@ def project_grad(
 
 
 def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
-    """Return the numbers of a step for the kernel of `project_step`: the penalty weights; two roots 1 / sqrt(1 -
-    beta2^t), one for sh_rest and before it one for all other groups; for each group the learning rate / (1 - beta1^t).
+    """Return the arguments of the kernel of `project_step` that change from step to step.
 
-    t: number of updates of a group, including this step's.
+    They are the penalty weights; 1 / sqrt(1 - beta2^t), first for all groups but sh_rest, then for sh_rest; and the
+    learning rate / (1 - beta1^t) of each group. Here t is the number of a group's updates, including this step's. The
+    numbers of sh_rest are 0 if the step does not update it.
     """
     rates, number, every = step.rates, step.number, step.config.sh_rest_every
     shrunk, root = of_rest, root_of_rest = step.corrections(number)
@@ -332,7 +333,7 @@ class _Build(NamedTuple):
 
 
 def _build(device: Device) -> _Build:
-    """Return how project_grad.cl is built: for cameras that evaluate Gaussians along rays, with one lane."""
+    """Return how project_grad.cl is built. Gaussians that are evaluated along rays are computed with one lane."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 

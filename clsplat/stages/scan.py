@@ -13,7 +13,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 
 CHUNK_ELEMENTS_PER_ITEM = 16
-"""Elements of a chunk for each work-item of its group, in groups of several items: this number or a multiple of it."""
+"""In groups of several items, the number of elements of a chunk per work-item is this number or a multiple of it."""
 MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
 """For groups of one item: minimum elements of a chunk, and maximum elements that are scanned as a single chunk. Several
 chunks need a second launch, which with fewer elements takes longer than the chunks save."""
@@ -49,7 +49,7 @@ class Elements:
 def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
     """Return the number of groups that share n elements, and the number of elements in each group's chunk.
 
-    items: work-items of a group, if different from the kernel shape.
+    items: number of work-items of a group; 0 for the number in the kernel shape.
     """
     items = items or device.shape.items
     if items == 1:

@@ -105,7 +105,7 @@ def splats_grad(
 ) -> None:
     """Fill every row of `gradients` from the slots of the pairs.
 
-    slots: results of `blend_grad` or `values_grad`, with or without absolute gradients.
+    slots: filled by blend_grad.cl or values_grad.cl, with or without absolute gradients.
     kept: number of values, from the first on, whose gradients the slots hold.
     """
     assert slots.first_slots is not None, "expected slots of pairs, not their sums over bands"

@@ -66,7 +66,7 @@ def target(
     render `blended` too; the gradient of blending skips them. An image on the host is uploaded as `on_device` does.
     """
     source = on_device(work, image)
-    device.under_way.append(source.buffer)  # it may be host memory, and must exist until the kernel has run
+    device.under_way.append(source.buffer)  # keeps the buffer, which may be host memory, until the kernel has run
     height, width, channels = source.shape
     if not (in_planes or alpha) and is_photograph(source) and tile_items(device) > 1:
         return source

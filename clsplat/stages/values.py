@@ -23,14 +23,14 @@ _MAX_LOCAL_SUMS = 2048
 """Maximum number of sums in local memory, values times work-items, of a group in the gradient."""
 
 
-def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
-    """Divide the values with indices [first, depth) into passes. Yields the first index of a pass, and its number of
+def passes(first: int, end: int, most: int) -> Iterator[tuple[int, int]]:
+    """Divide the values with indices [first, end) into passes. Yields the first index of a pass, and its number of
     values.
 
     most: maximum number of values per pass.
     """
-    for begin in range(first, depth, most):
-        yield begin, min(most, depth - begin)
+    for begin in range(first, end, most):
+        yield begin, min(most, end - begin)
 
 
 def most_values(device: Device) -> int:
@@ -50,8 +50,8 @@ class ValuePass:
     """Values per Gaussian, and the image with whose weights they are blended.
 
     lists, projected, blended: tile lists, splats and results of the image.
-    values: (n, depth), the values of all Gaussians.
-    background: (depth,), the value of each channel behind all Gaussians.
+    values: (n, D), the values of all Gaussians.
+    background: (D,), the values behind all Gaussians.
     """
 
     lists: TileLists
@@ -65,7 +65,7 @@ class ValuePass:
 def values(device: Device, of: ValuePass, pixels: DeviceArray, *, first: int = SPLAT_VALUES) -> None:
     """Blend the values from index `first` on over their background, with the weights of the image.
 
-    pixels: (height, width, depth), filled with the result.
+    pixels: (height, width, D), filled with the result.
     """
     height, width, depth = pixels.shape
     lists, cells = of.lists, of.blended.cells_from_sorted
@@ -92,7 +92,7 @@ def values_grad(
 
     of: the arguments of `values`: the values, and the image by whose weights they are blended.
     first_slots: (n,), the first slot of each Gaussian.
-    d_pixels: (height, width, depth), the gradient with respect to the blended values.
+    d_pixels: (height, width, D), the gradient with respect to the blended values.
     d_alpha: (height, width), the gradient with respect to alpha; None means zero.
     fields: fields of the slots; with absolute gradients if `gradients.absolute` is wanted.
     """
@@ -119,7 +119,7 @@ def values_grad(
 def _gradient_by_cell(
     device: Device, work: Workspace, of: ValuePass, d_pixels: DeviceArray, d_alpha: DeviceArray | None
 ) -> DeviceArray:
-    """Reorder the image's gradient as `values_grad` reads it: (tiles, depth + 1, pixels of a tile)."""
+    """Reorder the image's gradient as `values_grad` reads it: (tiles, D + 1, pixels of a tile)."""
     height, width, depth = d_pixels.shape
     by_cell = work.array("gradient_by_cell", (of.lists.band.tiles, depth + 1, TILE * TILE))
     given = [] if d_alpha is None else [d_alpha]
