@@ -191,7 +191,8 @@ def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "
     """Yield a writer of a video, as a context manager. If the block succeeds, the video replaces the file `path`.
 
     comment: provenance record for the header.
-    Raises InputError for another extension, a missing folder, a video without frames, or if PyAV is not installed.
+    Raises InputError for an extension other than .mp4 and .mov, a missing folder, a video without frames, or a missing
+    PyAV.
     """
     config = config or VideoConfig()
     config.check()

@@ -235,7 +235,7 @@ class Scene:
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings (`scenes.analysis`) are based on: all views, or an even sample of many views."""
+        """Views that findings (`scenes.analysis`) are based on: all, or in large scenes a sample of training views."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
