@@ -78,7 +78,7 @@ def train(
     resume : bool
         Continue from the run's latest checkpoint. If False, a run that already has a trained model is refused.
     on_step : callable, optional
-        Called with a report every REPORT_EVERY steps.
+        Called with a report every 10 steps (`REPORT_EVERY` in `clsplat/training/loop.py`).
     on_plan : callable, optional
         Called with the memory plan before the first step and after each change.
     between : callable, optional

@@ -139,7 +139,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
         if not (folder := path / chosen).is_dir():
             raise InputError(f"{folder}: no such folder, expected the images of {model_path}")
         return folder
-    # If the model's own folder or sparse/ was given, the pictures are next to one of the folders above it.
+    # If the model's own folder or sparse/ was given, the folder of pictures is in one of the folders above it.
     above = [path, *path.resolve().parents[:2]] if model_path == path or path.name in MODEL_FOLDERS else [path]
     usual = [inside(parent, (COLMAP_IMAGE_FOLDER,)) or parent / COLMAP_IMAGE_FOLDER for parent in above]
     if own := next((folder for folder in usual if has_pictures(folder)), None):

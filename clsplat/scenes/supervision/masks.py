@@ -88,7 +88,7 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     values or the folder's other masks are dark too.
 
     orient: rotate the mask by its EXIF orientation.
-    invert: exchange the pixels that are kept and those that are not.
+    invert: exchange kept and other pixels.
     """
     image = read_image(path, orient=orient)
     pixels = image[:, :, :3]
@@ -195,8 +195,8 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 def _like(path: Path) -> list[Path]:
     """Return about COMPARED_MASKS evenly spaced masks from the folder of the mask `path`, which may be among them.
 
-    If the name of `path` contains "mask", all files whose names contain it count as masks, otherwise all files whose
-    names do not. This leaves out photographs in the same folder as masks.
+    If `path` has "mask" in its name, the files with "mask" in their names are the masks, otherwise the files without.
+    This leaves out photographs in the same folder.
     """
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
@@ -356,7 +356,7 @@ def stage_mask(
 
     path: the mask file, None for all white.
     size: the photograph's width and height.
-    invert: exchange the pixels that the mask file keeps and those that it does not.
+    invert: exchange kept and other pixels of the mask file.
     photo: the photograph, if its alpha is a mask too.
     Raises InputError for a mask of another size.
     """
