@@ -95,7 +95,7 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
-    """Write an image file of one part, atomically, in pieces. Each piece has some rows; the first is at the top.
+    """Write an image file of one part, atomically, in pieces of consecutive rows, the top rows first.
 
     kind: the file's extension without the dot.
     pieces: pixels or OpenImageIO's deep data, each with its number of rows. The next piece is requested while the last

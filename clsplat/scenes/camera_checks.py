@@ -34,7 +34,7 @@ MIN_POSE_CHECK_POINTS = 30
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
 """Thresholds for suggesting another convention of the poses (POSE_MISREADINGS).
 
-Another convention is suggested if views then show, on average, at least the first fraction of the points. This must
+Another convention is suggested if, with it, views show on average at least the first fraction of the points. This must
 also be at least the second number times the fraction that they show with the poses as given. The first threshold
 excludes aerial surveys, where a picture shows about 1 % of the points with either convention.
 """
@@ -271,8 +271,8 @@ def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
 def _facing(cameras: Sequence[Camera]) -> float:
     """Return the fraction of the cameras that face a common point, the point nearest to all optical axes.
 
-    A camera never counts if it is nearer to the common point than about half the median distance of the cameras from
-    their middle.
+    A camera is never counted if it is nearer to the common point than about half the median distance of the cameras
+    from their middle.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])

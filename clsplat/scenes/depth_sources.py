@@ -226,8 +226,8 @@ def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
 def length_unit_of(scene: Scene) -> float:
     """Return the scene's length unit, in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
 
-    The median is taken first over the points that a training photograph shows, then over the photographs. COLMAP's
-    tracks tell which points a photograph shows. Without tracks, only the nearest point in each cell of pixels counts.
+    The median is first over the points that a training photograph shows, then over the photographs. COLMAP's tracks
+    tell which points a photograph shows. Without tracks, it shows the nearest point in each cell of pixels.
     """
     medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
     unit = DEPTH_TO_UNIT * float(np.median(medians)) if medians else np.inf

@@ -133,7 +133,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
     model lists is used, else the first folder with any pictures. Warns if the folder is not images/.
 
     chosen: folder with the pictures, relative to `path`; None to search.
-    Raises InputError if there is no folder with pictures, and no empty images/ either.
+    Returns an empty images/ if no folder has pictures. Raises InputError if there is no images/ either.
     """
     if chosen is not None:
         if not (folder := path / chosen).is_dir():

@@ -152,7 +152,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
 
 
 def _sampled_training_views(scene: Scene) -> list[View]:
-    """Return the training views among `Scene.sampled_views`, the views with thumbnails."""
+    """Return the training views among `Scene.sampled_views`, which are the views with thumbnails."""
     return [view for view in scene.sampled_views if view.split == "train"]
 
 

@@ -57,8 +57,8 @@ class Answer:
 
     settings: the recommended settings. Empty if nothing is known to help, or if every option is incompatible with the
         other settings or would change a setting that the user has chosen.
-    given: if every option would change a setting that the user has chosen: name of the setting that the best option
-        would change; else "".
+    given: name of the setting that the best option would change, if every option would change a setting that the user
+        has chosen; else "".
     """
 
     finding: Finding

@@ -248,8 +248,8 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict:
     """Find the masks of a scene's photographs, by the photographs' names; none if masks and alpha are not used.
 
     where: the scene, for messages.
-    strict: raise InputError for a mask that fits no photograph. Must be False if photographs are missing, whose masks
-        may exist.
+    strict: raise InputError for a mask that fits no photograph. Must be False if photographs are missing: their
+        masks may exist.
     Warns of photographs without a mask. Raises InputError if there are no masks, or one is missing, has another size,
     or fits no photograph.
     """
