@@ -84,7 +84,7 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """If the lens is a fisheye or panorama, the camera model that renders through it; None for all other lenses."""
+        """Camera model that renders through this fisheye or panorama lens; None for all other lenses."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
