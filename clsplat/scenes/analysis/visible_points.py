@@ -76,7 +76,7 @@ class VisiblePoints:
         """log2 gain (3,) of each view, by the view's name, relative to the median of all views.
 
         A gain is the median, over the points in the view, of the colour in the view divided by the point's own colour.
-        Points without their own colours are unused. Views with fewer than MIN_POINTS_PER_VIEW usable points are left out.
+        Points without own colours are not used. Views with fewer than MIN_POINTS_PER_VIEW usable points are left out.
         """
         found = {}
         for name, (which, rows, columns, _) in self.places.items():
