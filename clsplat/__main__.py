@@ -23,7 +23,7 @@ def main() -> int:
             return run()
     except KeyboardInterrupt as error:  # Ctrl-C before the command line could catch it
         print("clsplat: interrupted", file=sys.stderr)
-        return 128 + getattr(error, "number", 2)  # what `process.status_of` returns; it may not be imported yet
+        return 128 + getattr(error, "number", 2)  # as in `process.status_of`, which may not be imported yet
 
 
 if __name__ == "__main__":

@@ -30,8 +30,8 @@ def devices() -> list[DeviceInfo]:
     Returns
     -------
     list of DeviceInfo
-        Index, name, platform, version, kind, compute_units, memory_bytes, and kernel shape. Other calls take as
-        `device` an index as text, "cpu", "gpu", or a part of a name, platform or version.
+        Index, name, platform, version, kind, compute_units, memory_bytes, and kernel shape. The argument `device` of
+        other calls is an index as text, "cpu", "gpu", or a part of a name, platform or version.
     """
     return list_devices()
 
@@ -60,16 +60,16 @@ def train(
     config : TrainConfig, optional
         Settings, which are written to the run. None means the run's settings, or the defaults without a run.
     device : Device, str or sequence of Device, optional
-        An open device, or a name as `clsplat devices` lists them. Several devices, or names separated by commas, share
-        the views of a step (`TrainConfig.batch`).
+        An open device, or text that selects a device (see `devices`). Several devices, or such texts separated by
+        commas, share the views of a step (`TrainConfig.batch`).
     max_device_mem : str or int, optional
         Largest amount of memory to use on each device: a number of bytes, or text such as "256MiB".
     max_host_mem : str or int, optional
-        Largest amount of main memory to use for photographs and Gaussians together, like `max_device_mem`. Photographs
-        beyond it are read from `cache`, or decoded again.
+        Largest amount of main memory to use for photographs and Gaussians together, in the form of `max_device_mem`.
+        Photographs beyond it are read from `cache`, or decoded again. None means no limit.
     cache : str or Path, optional
-        Folder for decoded photographs, which stays and may be shared by trainings, or "none". None means the run's
-        folder until the training has finished if `max_host_mem` is given, else no cache.
+        Folder for decoded photographs, which is kept and may be shared by trainings; "none" for no cache. None means
+        a folder in the run that is removed after training if `max_host_mem` is given, else no cache.
     scratch : str or Path, optional
         Folder of the file with Gaussians that do not fit in `max_host_mem`. If the run's checkpoints refer to the file,
         it is kept after training. None means the run's folder.
@@ -78,7 +78,7 @@ def train(
     resume : bool
         Continue from the run's latest checkpoint. If False, a run that already has a trained model is refused.
     on_step : callable, optional
-        Called with a report every REPORT_EVERY steps.
+        Called with a report every 10 steps (`REPORT_EVERY` in `clsplat/training/loop.py`).
     on_plan : callable, optional
         Called with the memory plan before the first step and after each change.
     between : callable, optional
@@ -93,7 +93,7 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no views, is not the resumed run's scene, or another process writes the run.
+        If the scene has no training views, if it is not the resumed run's scene, or if another process writes the run.
     ClsplatError
         If values are repeatedly not finite (docs/decisions/0016-never-a-nan.md). Values that could be repaired cause
         only a warning.
@@ -124,7 +124,7 @@ def train(
 
 
 def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -> list[Device]:
-    """Open the devices, with at most `limit` bytes of memory each. Raises InputError if no device matches `device`."""
+    """Open the devices, with at most `limit` bytes of memory each, if set. Raises InputError if no device matches."""
     if device is None or isinstance(device, str):
         with of_argument():
             return open_devices(device, limit)

@@ -77,8 +77,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""A scene's near plane is at most the scene's length unit divided by this number. A tiny model's near plane is at most
-the model's size divided by it."""
+"""Minimum ratio of a scene's length unit to the scene's near plane, and of a tiny model's size to the model's near
+plane."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
@@ -303,7 +303,7 @@ class Camera:
 
     def before(self, near: float) -> Camera:
         """The same view with the near plane `near` of a model, in world units. A camera whose near plane is not the
-        default keeps it."""
+        default keeps its own."""
         return replace(self, near=near) if self.near == DEFAULT_NEAR_PLANE != near else self
 
     def along_rays(self, by_rays: bool) -> Camera:

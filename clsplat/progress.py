@@ -43,7 +43,7 @@ class CountedFraction(float):
     """A fraction that is reported as a count, such as "12 of 25 registered". total: at least 1."""
 
     def __new__(cls, done: int, total: int, verb: str) -> Self:
-        """The fraction done / total, at most 1."""
+        """The fraction done / total, at most 1. verb: what was done, such as "registered"."""
         value = super().__new__(cls, min(done / total, 1.0))
         value.text = f"{min(done, total):,} of {total:,} {verb}"
         return value
@@ -188,6 +188,7 @@ class FrameProgress(_Bar):
     """Progress of frames. Call it with each `sequence.task.Record` when its file is complete.
 
     total: number of frames, skipped ones included.
+    lines: stream for lines of progress, None for none.
     style: "auto": a bar on standard error if that is a terminal, and on `lines` a line for each written frame, with the
       remaining time. No lines are written if `lines` is None, or if both streams are terminals.
       "json": one object per line on `lines`. "openjd": progress lines of Open Job Description. "none": nothing.

@@ -79,7 +79,7 @@ class CameraModel:
     """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its OpenCL functions are in kernels/shared/camera/.
 
     projection: the model's name in `Camera.projection` and in camera files.
-    option: the field of `Camera` that selects this model among those with its projection; "" for the default model.
+    option: the field of `Camera` that selects this model among models of the same projection; "" for the default model.
     defines: build defines of the model's kernels. With RAYS a Gaussian is evaluated along the ray of each pixel.
     lenses: lens models of photographs that this model can be trained on, either as they are or undistorted.
     transforms: values of `camera_model` in a transforms.json that mean this model.

@@ -135,6 +135,7 @@ def _scores(
 
     image, truth: the view's render, and the photograph over the same background.
     counts: mask (H, W), True for pixels that are compared; None for all.
+    corrected, aligned: as for `evaluate`.
     """
     try:
         record: ViewScores = {

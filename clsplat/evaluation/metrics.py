@@ -29,7 +29,10 @@ Image = NDArray[Any]
 
 
 def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, at most 120. Raises ValueError for images of different shapes."""
+    """Peak signal-to-noise ratio in dB, at most 120. Raises ValueError for images of different shapes.
+
+    counts: (H, W), True for pixels to compare; None for all.
+    """
     a, b = _pair(image, truth)
     squares = np.square(a - b) if counts is None else np.square(a - b)[counts]
     return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
@@ -39,6 +42,8 @@ def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None 
     """PSNR in dB of the image after the affine fit of colours by `corrected`, with a peak of 1.
 
     Both images are clamped to [0, most], where `most` is the photograph's largest value, but at least 1.
+
+    counts: (H, W), True for pixels to compare; None for all.
     """
     most = max(1.0, float(truth.max() if counts is None else truth[counts].max(initial=1.0)))
     fitted = corrected(image, truth, counts)
@@ -48,7 +53,10 @@ def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None 
 
 
 def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> Image:
-    """Return the image (H, W, 3) after the affine transform of colours that fits `truth` best, by least squares."""
+    """Return the image (H, W, 3) after the affine transform of colours that fits `truth` best, by least squares.
+
+    counts: (H, W), True for pixels that the fit uses; None for all.
+    """
     colours, wanted = (np.asarray(each, np.float64).reshape(-1, 3) for each in (image, truth))
     known = np.hstack([colours, np.ones((len(colours), 1))])
     rows = slice(None) if counts is None else counts.ravel()
@@ -60,7 +68,8 @@ def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = Non
 def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity over pixels and channels, by the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5.
 
-    Pixels outside the mask are black in both images. The mean is over the windows centred on pixels in the mask.
+    counts: mask (H, W), None for all pixels. Pixels outside the mask are black in both images. The mean is over the
+        windows centred on pixels in the mask.
 
     Raises InputError for images smaller than the window, ValueError for images of different shapes.
     """

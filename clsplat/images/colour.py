@@ -121,7 +121,7 @@ def displayed(rgb: NDArray[Any], space: str) -> Float32:
 
 @lru_cache(maxsize=8)
 def _to_srgb(space: str, source: str) -> Colours:
-    """Return the `Colours` of a model whose output is sRGB. They are cached, because a viewer shows many images.
+    """Return `Colours` that convert from a model's space to sRGB. They are cached, as a viewer shows many images.
 
     space: the model's colour space.
     source: OpenColorIO configuration; "" for the built-in one.

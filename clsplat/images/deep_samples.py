@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conversion of deep samples from arrays to OpenImageIO's deep data, by way of a scratch deep EXR.
 
-OpenImageIO's Python interface sets deep values one by one, which takes twenty times as long as rendering the frame, but
-reads a deep file at once. So this module writes the samples to an uncompressed deep EXR, whose layout is simple
+OpenImageIO's Python interface sets deep values one by one, which takes twenty times as long as rendering the frame.
+Reading a deep file is fast. So this module writes the samples to an uncompressed deep EXR, whose layout is simple
 (https://openexr.com/en/latest/OpenEXRFileLayout.html), and OpenImageIO reads it. OpenImageIO then writes the final file
 with its header and compression.
 """

@@ -207,7 +207,7 @@ def is_whole(
     """Return True if the file is complete and holds these channels as `write_channels` writes them.
 
     The image must have this size and a last row that decodes. If the file contains a disk block of zeros, every row
-    must decode. Each of `attributes` must have its value in the file's header or be absent.
+    must decode. Attributes of the file's header must have the values given in `attributes`, but may be absent.
 
     deep: expect a deep image, whose channels are DEEP_CHANNELS.
     views: number of views; each must have these channels.

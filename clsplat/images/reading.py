@@ -286,7 +286,8 @@ def open_image(path: Path) -> Any:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Open a file, yield OpenImageIO's input, or None if it is not an image, and close it. Errors are discarded."""
+    """Open a file and yield OpenImageIO's input, None if the file is not an image. At the end, close the input and
+    discard OpenImageIO's errors."""
     source = oiio.ImageInput.open(native_name(path))
     try:
         yield source

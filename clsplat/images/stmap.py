@@ -77,7 +77,7 @@ class StMap:
         def line(row: np.ndarray) -> Float64:
             begin, end = (values[row[:, None], column[None, :]].astype(np.float64) for column in (left, right))
             mixed = begin + across * (end - begin)
-            return np.asarray(np.where(across == 0, begin, mixed))  # avoids 0 times a non-finite neighbour
+            return np.asarray(np.where(across == 0, begin, mixed))  # 0 times a non-finite neighbour would be NaN
 
         upper, lower = line(above), line(below)
         return np.asarray(np.where(down == 0, upper, upper + down * (lower - upper)))

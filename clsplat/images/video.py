@@ -48,7 +48,7 @@ def video_missing() -> str:
 MBTREE_MIN_SIDE_PX = 128
 """x264's macroblock tree (mbtree) is switched off for videos whose shorter side is below this number of pixels.
 
-With the tree, the bytes of small videos vary: on a busy machine, up to 102 of 250 encodings of a 48x40 video differed,
+With the tree, the bytes of small videos vary. On a busy machine, up to 102 of 250 encodings of a 48x40 video differed,
 but none of 225 of a 320x240 video. In a larger video the tree saves a quarter of the bytes.
 """
 
@@ -191,7 +191,8 @@ def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "
     """Yield a writer of a video, as a context manager. If the block succeeds, the video replaces the file `path`.
 
     comment: provenance record for the header.
-    Raises InputError for another extension, a missing folder, a video without frames, or if PyAV is not installed.
+    Raises InputError for an extension other than .mp4 and .mov, a missing folder, a video without frames, or a missing
+    PyAV.
     """
     config = config or VideoConfig()
     config.check()

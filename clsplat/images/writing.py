@@ -95,7 +95,7 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
-    """Write an image file of one part, atomically, in pieces of some rows from the top.
+    """Write an image file of one part, atomically, in pieces of consecutive rows, the top rows first.
 
     kind: the file's extension without the dot.
     pieces: pixels or OpenImageIO's deep data, each with its number of rows. The next piece is requested while the last
@@ -143,8 +143,8 @@ def _write(
 
     specs: OpenImageIO specification of each part of the file.
     kind: the file's extension without the dot.
-    steps: generator function that writes the pixels, given OpenImageIO's open file and the file's name. After each of
-        several calls of OpenImageIO it yields True if the call succeeded.
+    steps: generator function that writes the pixels, given OpenImageIO's open file and the file's name. After each call
+        of OpenImageIO that writes, it yields whether the call succeeded.
     reasons: messages of calls that failed in another thread.
     """
     # Before a JPEG is written, disk space is checked, because libjpeg ends the process if it cannot write.
@@ -163,7 +163,7 @@ def _write(
                     _without_name(temporary)
                 return
             reason = "the file is incomplete" if written else "; ".join(reasons) or file.geterror()
-            if error := room_error(temporary.parent):  # OpenImageIO seldom reports the system's error
+            if error := room_error(temporary.parent):  # OpenImageIO seldom reports a full disk as such
                 raise OSError(error.errno, error.strerror)
             raise ClsplatError(f"{path}: cannot be written: {plain(one_line(reason))}")
         finally:

@@ -34,9 +34,9 @@ MIN_POSE_CHECK_POINTS = 30
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
 """Thresholds for suggesting another convention of the poses (POSE_MISREADINGS).
 
-Another convention is suggested if, with it, views show on average at least the first fraction of the points, and at
-least the second number times the fraction that they show with the poses as given. The first threshold excludes aerial
-surveys, where a picture shows about 1 % of the points with either convention.
+Another convention is suggested if, with it, views show on average at least the first fraction of the points. This must
+also be at least the second number times the fraction that they show with the poses as given. The first threshold
+excludes aerial surveys, where a picture shows about 1 % of the points with either convention.
 """
 BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
 """Fraction of visible points below which a view is blind, and fraction of blind views that makes the poses doubtful.
@@ -64,7 +64,10 @@ OPENGL_AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
 
 
 def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Return the images' cameras at full size (`Lens.camera`), keyed by image name. Warns of implausible cameras."""
+    """Return the images' cameras at full size (`Lens.camera`), keyed by image name. Warns of implausible cameras.
+
+    lenses: "undistort" turns fisheyes into pinhole cameras, "native" keeps them.
+    """
     by_lens = {
         lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
     }
@@ -101,7 +104,8 @@ def _focal(views: Sequence[Named]) -> str:
     lens = short[0][1]
     return (
         f"the focal length of {examples(name for name, _ in short)} is {lens.focal:g} pixels for a picture of "
-        f"{lens.width}x{lens.height}, too short for any lens: is it in millimetres or widths? Give it in pixels"
+        f"{lens.width}x{lens.height}, too short for any lens: is it in millimetres, or in picture widths? Give it in "
+        "pixels"
     )
 
 
@@ -136,7 +140,7 @@ def _another_size(views: Sequence[Named]) -> str:
     return (
         f"the principal point (cx cy) of {examples(name for name, _ in odd)}, {x:g} {y:g}, is the middle of a picture "
         f"of {2 * x:g}x{2 * y:g} pixels, but 'w' and 'h' are {lens.width}x{lens.height}: do the intrinsics belong to "
-        "another size? Give all for one size"
+        "another size? Give all intrinsics for the same size"
     )
 
 
@@ -267,8 +271,8 @@ def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
 def _facing(cameras: Sequence[Camera]) -> float:
     """Return the fraction of the cameras that face a common point, the point nearest to all optical axes.
 
-    A camera that is much nearer to the common point than half the median distance of the cameras from their middle does
-    not count as facing it.
+    A camera is never counted if it is nearer to the common point than about half the median distance of the cameras
+    from their middle.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])

@@ -72,7 +72,10 @@ class Keys:
         return vector
 
     def focal(self, key: str, size: int, projection: Projection = Camera.projection) -> float:
-        """Return the focal length in pixels with which `size` pixels show the angle of view under `key`, in degrees."""
+        """Return the focal length in pixels with which `size` pixels show the angle of view under `key`, in degrees.
+
+        projection: the camera's projection, which relates the focal length to the angle of view.
+        """
         try:
             return focal_length(math.radians(self.require(key)), size, projection)
         except ValueError as error:

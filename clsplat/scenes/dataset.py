@@ -62,8 +62,8 @@ def colmap_camera_models() -> dict[int, tuple[str, int]]:
 
 @cache
 def lens_models() -> dict[str, tuple[LensModel, CameraModel]]:
-    """Return, by the name of each lens model (such as COLMAP's OPENCV_FISHEYE), the lens model and the camera model
-    that has it."""
+    """Return each lens model and the camera model that supports it (`CameraModel.lenses`). The keys are the lens
+    models' names, such as COLMAP's OPENCV_FISHEYE."""
     return {lens.name: (lens, model) for model in CAMERA_MODELS for lens in model.lenses}
 
 
@@ -84,7 +84,7 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """The camera model that renders fisheyes and panoramas like this lens; None for all other lenses."""
+        """Camera model that renders through this fisheye or panorama lens; None for all other lenses."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
@@ -220,7 +220,7 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image of a data set: its name, the lens at the size in the data set, and the pose `cam_from_world`.
+    """An image of a data set: its name, its lens at the size that the data set gives, and the pose `cam_from_world`.
 
     rotation, translation: (3, 3) and (3,), float64.
     path: the file, if the data set names it.
@@ -380,7 +380,10 @@ def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> t
 
 
 def occlusion_cell(camera: Camera, points: int) -> float:
-    """Return the side in pixels of an occlusion cell in a picture of this camera that shows this number of points."""
+    """Return the side in pixels of the occlusion cells of a camera's picture (POINTS_PER_OCCLUSION_CELL).
+
+    points: number of points that the picture shows.
+    """
     cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(points, 1))
     return float(max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0))
 

@@ -226,9 +226,8 @@ def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
 def length_unit_of(scene: Scene) -> float:
     """Return the scene's length unit, in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
 
-    The median depth is the median over the training photographs of the median depth of the points that each shows.
-    COLMAP's tracks tell which points a photograph shows. Without tracks, these are the nearest points in cells of
-    pixels.
+    The median is first over the points that a training photograph shows, then over the photographs. COLMAP's tracks
+    tell which points a photograph shows. Without tracks, it shows the nearest point in each cell of pixels.
     """
     medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
     unit = DEPTH_TO_UNIT * float(np.median(medians)) if medians else np.inf

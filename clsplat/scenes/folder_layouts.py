@@ -49,7 +49,8 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # If nerfstudio made transforms.json from the model in colmap/, use the former: the model has larger pictures.
+    # nerfstudio makes transforms.json from a model in colmap/, whose pictures may be larger than those of
+    # transforms.json. So transforms.json is preferred.
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():
@@ -70,7 +71,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
     Raises InputError if the model or its pictures cannot be read.
     """
     model_path = colmap.find_model(path)
-    assert model_path is not None  # detect has found it
+    assert model_path is not None  # `detect` has checked this
     model = colmap.read_model(model_path)
     folder = _picture_folder(path, chosen, model_path, model.images)
     present = find_images(folder)
@@ -100,6 +101,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
 def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
     """Read the data set of one transforms.json, or of Blender's two files for training and test.
 
+    kind: "transforms" or "blender".
     chosen: folder with the pictures, relative to `path`; None to use the paths in the file.
     missing: how many pictures may be missing, as for `find_pictures`.
     masks: True if masks are used.
@@ -126,15 +128,18 @@ def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: 
 def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
     """Find the folder with the pictures of a COLMAP model.
 
-    The first of these folders that has pictures is used: images/, a downscaled copy such as images_2, a folder named in
-    OTHER_IMAGE_FOLDERS, and the scene's folder. After images/, folders with a picture that the model lists come first.
-    Warns if the folder is not images/. Raises InputError if there is no such folder.
+    This is images/ if it has pictures. Otherwise a downscaled copy such as images_2, folders named in
+    OTHER_IMAGE_FOLDERS, and the scene's folder are searched in this order. The first folder with a picture that the
+    model lists is used, else the first folder with any pictures. Warns if the folder is not images/.
+
+    chosen: folder with the pictures, relative to `path`; None to search.
+    Returns an empty images/ if no folder has pictures. Raises InputError if there is no images/ either.
     """
     if chosen is not None:
         if not (folder := path / chosen).is_dir():
             raise InputError(f"{folder}: no such folder, expected the images of {model_path}")
         return folder
-    # If the model's own folder or sparse/ was given, the pictures are next to one of the folders above it.
+    # If the model's own folder or sparse/ was given, the folder of pictures is in one of the folders above it.
     above = [path, *path.resolve().parents[:2]] if model_path == path or path.name in MODEL_FOLDERS else [path]
     usual = [inside(parent, (COLMAP_IMAGE_FOLDER,)) or parent / COLMAP_IMAGE_FOLDER for parent in above]
     if own := next((folder for folder in usual if has_pictures(folder)), None):

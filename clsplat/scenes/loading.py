@@ -63,7 +63,8 @@ def load_scene(
     path: a folder in a layout that `detect` knows, or a transforms.json.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
-    test_most: maximum number of views that `test_every` holds out; of more it takes an even selection. 0: no maximum.
+    test_most: maximum number of held-out views. If `test_every` gives more, an even selection of them is held out. 0
+        for no maximum.
     images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
         images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
         Such a folder of any size is used if there are no other pictures.
@@ -99,7 +100,7 @@ def load_scene(
         files = _read(path, kind, images, missing, masks, work_dir, progress)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
-        # Cameras that are outliers are left out, because `_scene` has already warned of them.
+        # Outlier cameras are not checked, because `_scene` has already warned of them.
         near_views = [view for view in views if view.name not in scene.stray_cameras]
         for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
             warn(doubt)
@@ -154,6 +155,7 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
     aspect ratio.
 
     test_views: test_every and test_most, as for `load_scene`.
+    resolution, lenses: as for `load_scene`.
     """
     data = files.data
     posed = sorted(data.images, key=lambda image: image.name)
@@ -240,7 +242,7 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
 
 def _warn_of_copies(views: list[View]) -> None:
-    """Warn of held-out pictures that are also training pictures, whose scores do not measure other viewpoints."""
+    """Warn of held-out pictures that are also training pictures: their scores do not measure unseen viewpoints."""
     by_size: dict[int, list[View]] = {}
     for view in views:
         by_size.setdefault(view.path.stat().st_size, []).append(view)
@@ -260,7 +262,8 @@ def _warn_of_copies(views: list[View]) -> None:
 def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Path], lenses: Lenses) -> View:
     """Return the view of an image at the working size. Reads and checks the picture's header.
 
-    smaller: folders with downscaled copies of the pictures; one with exactly the working size is used.
+    resolution, lenses: as for `load_scene`.
+    smaller: folders with downscaled copies of the pictures; a copy of the working size is used.
     """
     lens, upright = _fit(image.path, image.lens)
     camera = lens.camera(image.rotation, image.translation, lenses)
@@ -299,7 +302,7 @@ def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
-    """Return True if a picture is downscaled and has the requested size, up to 1 pixel of the shorter side.
+    """Return True if a picture is downscaled and has the requested size, to within 1 pixel on the shorter side.
 
     lens: the lens at the size of the original picture.
     """

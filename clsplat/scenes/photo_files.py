@@ -100,7 +100,7 @@ def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> 
 
 
 def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> dict[str, Path]:
-    """Return the pictures by their paths relative to `folder`, without masks, depth maps and downscaled copies.
+    """Return the pictures, keyed by their paths relative to `folder`, without masks, depth maps and downscaled copies.
 
     present: the pictures in `folder`.
     used: pictures that the data set uses. Their masks and depth maps are recognised by name.

@@ -124,8 +124,8 @@ class View:
     def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:
         """Read like `load_masked` at several sizes, (width, height), decoding the file only once.
 
-        reduce: resample the picture to the camera's size first, and from this to each size. This is faster, and differs
-        by rounding. Pictures with masked pixels are always resampled from the file's size.
+        reduce: resample the picture to the camera's size first, and from this to each size. This is faster; results
+        differ by rounding. Pictures with masked pixels are always resampled from the file's size.
         """
         image, counts = self._read(), None
         if self.mask is not None:
@@ -235,7 +235,7 @@ class Scene:
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings (`scenes.analysis`) are based on: all views, or an even sample of many views."""
+        """Views that findings (`scenes.analysis`) are based on: all, or in large scenes a sample of training views."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
@@ -292,8 +292,8 @@ class Scene:
     def stray_cameras(self) -> frozenset[str]:
         """Names of the views whose cameras are outliers, far from the other cameras and from the points.
 
-        A camera is not an outlier if its picture shows points in a fair part of its area. In scenes without points, it
-        is not an outlier if other cameras are near it.
+        A distant camera is not an outlier if its picture shows points over a sufficient part of its area. In scenes
+        without points, a distant camera is not an outlier if other cameras are near it.
         """
         centres = np.stack([view.camera.position for view in self.views])
         middle = np.median(centres, axis=0)
@@ -354,8 +354,8 @@ def spread(items: Sequence[T], most: int) -> list[T]:
 def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
     """Return True if a distant camera is not an outlier but part of the capture, for example in another room.
 
-    The picture must show points over a fair part of its area. Without points, at least MIN_FAR_GROUP_NEIGHBOURS other
-    cameras must be nearer to the camera than the median distance of all cameras from their middle.
+    The picture must show points over a sufficient part of its area. Without points, at least MIN_FAR_GROUP_NEIGHBOURS
+    other cameras must be nearer to the camera than the median distance of all cameras from their middle.
     """
     if len(points):
         rows, columns, _ = pixels_of(points, view.camera, view.lens)

@@ -42,7 +42,10 @@ class Masked:
 
 
 def masked(view: View, width: int, height: int) -> Masked:
-    """Load a view at this size, with the parts that masks leave out. Raises InputError if a file does not decode."""
+    """Load a view's photograph at this size, and the parts of it that masks leave out.
+
+    Raises InputError if a file does not decode.
+    """
     photograph = replace(view, mask=None).load(width, height)[:, :, :3]
     none = np.zeros((height, width, 1), np.float32)
     if view.mask is None:

@@ -117,8 +117,8 @@ class Finding:
 
     kind: name of the problem, such as "exposure".
     text: a clause for the report that describes the problem in this scene.
-    options: alternative settings that mitigate the problem, best first, if they depend on the scene. For the same
-        settings in all scenes see `recommendations.SETTINGS_BY_FINDING`.
+    options: alternative settings that mitigate the problem, best first, if they depend on the scene. If the
+        settings are the same in all scenes, they are in `recommendations.SETTINGS_BY_FINDING` instead.
     """
 
     kind: Kind
@@ -152,7 +152,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
 
 
 def _sampled_training_views(scene: Scene) -> list[View]:
-    """Return the training views in the sample for which `Scene.thumbnails` has thumbnails."""
+    """Return the training views among `Scene.sampled_views`, which are the views with thumbnails."""
     return [view for view in scene.sampled_views if view.split == "train"]
 
 
@@ -214,7 +214,7 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
 
 
 def _strange_masks(scene: Scene, reason: str) -> Finding | None:
-    """Return a finding about masks that cannot be used; None if no file in the mask folder fits a photograph.
+    """Return a finding about masks that cannot be used; None if no mask file matches a photograph.
 
     reason: why the masks cannot be used.
     """
@@ -301,7 +301,7 @@ def _sky(visible: VisiblePoints) -> Finding | None:
 
 
 def _sky_part(visible: VisiblePoints, view: View) -> float:
-    """Return the fraction of a view that is sky.
+    """Return the fraction of a view's pixels that show sky.
 
     Sky is a bright, smooth, blue or white region at the upper border, above the horizon, with hardly any points.
     """

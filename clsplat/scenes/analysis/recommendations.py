@@ -55,10 +55,10 @@ ADVICE_BY_FINDING: Mapping[Kind, str] = {
 class Answer:
     """A finding and the settings recommended for it.
 
-    settings: the recommended settings. Empty if nothing is known to help, or if all that helps is incompatible with the
-        other settings.
-    given: name of a setting that the user has chosen, and that every recommendation would change, so that `settings` is
-        empty; else "".
+    settings: the recommended settings. Empty if nothing is known to help, or if every option is incompatible with the
+        other settings or would change a setting that the user has chosen.
+    given: name of the setting that the best option would change, if every option would change a setting that the user
+        has chosen; else "".
     """
 
     finding: Finding

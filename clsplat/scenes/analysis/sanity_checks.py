@@ -108,7 +108,7 @@ def _many_points(scene: Scene) -> str:
 
 
 def _other_clouds(scene: Scene) -> str:
-    """Warn of unused clouds next to the scene that are not copies of its points."""
+    """Return a warning about unused point clouds next to the scene that do not just repeat its points, else ""."""
     if scene.start.file or not scene.clouds:
         return ""
     counts = {path: _count(path) for path in scene.clouds}
@@ -179,7 +179,7 @@ def _background(pictures: Sequence[NDArray[np.float32]], background: Background)
     edges = []
     for pixels in pictures:
         if pixels.shape[2] == 4 and pixels[:, :, 3].min() < 1:
-            return ""  # training composites a transparent photograph over the background
+            return ""  # transparent photographs are composited over the background, so every background suits them
         edges.append(np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])[:, :3])
     border = np.concatenate(edges)
     for name, part in (("white", (border >= WHITE_LEVEL).all(axis=1)), ("black", (border <= BLACK_LEVEL).all(axis=1))):

@@ -75,8 +75,8 @@ class VisiblePoints:
     def gains(self) -> dict[str, Float64]:
         """log2 gain (3,) of each view, by the view's name, relative to the median of all views.
 
-        A gain is the median ratio of the colours that the view shows at points to the colours that the scene gives
-        these points. Points without colours of their own are not used.
+        A gain is the median, over the points in the view, of the colour in the view divided by the point's own colour.
+        Points without own colours are not used. Views with fewer than MIN_POINTS_PER_VIEW usable points are left out.
         """
         found = {}
         for name, (which, rows, columns, _) in self.places.items():

@@ -102,6 +102,7 @@ def _clouds_below(folder: Path) -> list[str]:
 def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Missing) -> list[Path | None]:
     """Find the picture of each frame; None for pictures that are left out.
 
+    readers: the JSON values of each frame. images, missing: as for `read_transforms`.
     Warns and raises InputError like `find_pictures`. Also raises InputError for a name that leads out of the folder and
     matches no picture in the folder.
     """
@@ -139,7 +140,7 @@ def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
 def _moved(file: Path | None, copies: Mapping[Path, Path]) -> Path | None:
     """Return the path of a picture in a downscaled copy of its folder; `file` itself if there is no copy.
 
-    copies: downscaled copies of folders, by the folder. If several folders of a path have one, the outermost is used.
+    copies: maps folders to their downscaled copies. If several folders in a path have copies, the outermost is used.
     """
     usual = next((parent for parent in reversed(file.parents) if parent in copies), None) if file is not None else None
     return file if file is None or usual is None else copies[usual] / file.relative_to(usual)

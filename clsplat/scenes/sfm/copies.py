@@ -427,13 +427,16 @@ def _numbered(folder: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (folder, 1)
 
 
-def _is_downscaled(factor: int, by: int, whole: tuple[int, int], size: tuple[int, int]) -> bool:
+def _is_downscaled(large_factor: int, small_factor: int, large: tuple[int, int], small: tuple[int, int]) -> bool:
     """Return True if two pictures' sizes agree with the factors in the names of their folders.
 
-    whole, factor: width and height of the larger picture, and the factor by which it is downscaled.
-    size, by: width and height of the smaller picture, and the factor by which it is downscaled.
+    large_factor, small_factor: factors by which the larger and the smaller picture are downscaled.
+    large, small: width and height of the larger and the smaller picture.
     """
-    return factor < by and all(abs(side * by / factor - long) <= by for side, long in zip(size, whole, strict=True))
+    if large_factor >= small_factor:
+        return False
+    sides = zip(large, small, strict=True)
+    return all(abs(less * small_factor / large_factor - more) <= small_factor for more, less in sides)
 
 
 def _is_same(one: Decoded, two: Decoded) -> bool:

@@ -126,8 +126,8 @@ def reconstruct(
     paths, left_out = sfm_photos.find_photos(images, excluded=output)
     copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
     paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
-    shapes = _masks(images, paths, masks)
-    fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, shapes)}")
+    mask_files = _masks(images, paths, masks)
+    fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, mask_files)}")
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
         return output
@@ -142,7 +142,7 @@ def reconstruct(
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
         photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
-        masked = _staged_masks(photos, shapes, masks, work)
+        masked = _staged_masks(photos, mask_files, masks, work)
         answer = _run_worker(sfm_task(settings, photos, masked, work, workers), work, report)
         if "failure" in answer:
             raise InputError(_no_model(images, len(photos), answer["failure"]))
@@ -154,14 +154,14 @@ def reconstruct(
     return output
 
 
-def _described(masks: MaskUse | None, shapes: dict[str, Path]) -> str:
+def _described(masks: MaskUse | None, mask_files: dict[str, Path]) -> str:
     """Return the masks as text for the fingerprint: their use, and size and modification time of each mask file.
 
-    shapes: mask files by photograph.
+    mask_files: paths of the mask files, by photograph.
     """
     if masks is None:
         return ""
-    stats = [(name, path.stat()) for name, path in sorted(shapes.items())]
+    stats = [(name, path.stat()) for name, path in sorted(mask_files.items())]
     return f" {masks} {[(name, status.st_size, status.st_mtime_ns) for name, status in stats]}"
 
 
@@ -187,21 +187,21 @@ def _staged_photos(
 
 
 def _staged_masks(
-    photos: list[sfm_photos.Photo], shapes: dict[str, Path], masks: MaskUse | None, work: Path
+    photos: list[sfm_photos.Photo], mask_files: dict[str, Path], masks: MaskUse | None, work: Path
 ) -> list[str]:
     """Write the masks of the photographs under `work`. Returns the names of the photographs with a mask.
 
-    shapes: mask files by photograph. A photograph's alpha may be a mask too.
+    mask_files: paths of the mask files, by photograph. A photograph's alpha may be a mask too.
     """
     if masks is None:
         return []
     masked = []
     for photo in photos:
         cut = photo.transparent and masks.alpha != "blend"
-        if cut or photo.name in shapes:
-            shape, target = shapes.get(photo.name), work / "masks" / f"{photo.name}.png"
+        if cut or photo.name in mask_files:
+            mask_file, target = mask_files.get(photo.name), work / "masks" / f"{photo.name}.png"
             inner = work / "photos" / photo.name if cut else None
-            stage_mask(shape, target, (photo.width, photo.height), invert=masks.invert, photo=inner)
+            stage_mask(mask_file, target, (photo.width, photo.height), invert=masks.invert, photo=inner)
             masked.append(photo.name)
     return masked
 
@@ -243,6 +243,7 @@ def _warn_of_losses(
 
     registered: names of the photographs with a pose.
     result: folder of the undistorted photographs.
+    masks: use of masks and alpha. If alpha was used as a mask, its loss does not matter.
     """
     if missing := sorted({photo.name for photo in photos} - set(registered)):
         warn(f"{images}: no camera pose was found for {_listed(missing)}, which will not be used")
@@ -294,7 +295,9 @@ def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], 
 def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
     """Return True if the output is a complete result of the same photographs and settings.
 
-    Raises InputError for any other output that must not be replaced.
+    fingerprint: digest of the photographs and settings.
+    overwrite: True if an earlier result of sfm may be replaced.
+    Raises InputError for an output that must not be replaced.
     """
     if not output.exists():
         return False
@@ -336,6 +339,7 @@ def _sizes(result: Path) -> dict[str, int]:
 def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
     """Run `clsplat.scenes.sfm.worker` to its end. Returns the worker's answer, {"result"} or {"failure"}.
 
+    task: result of `sfm_task`. work: folder for the log and intermediate files.
     Raises ClsplatError if the worker ends without an answer.
     """
     log_path = work / "log.txt"
@@ -421,7 +425,7 @@ def _rows(database: Path, table: str) -> int:
 def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     return (
         f"{images}: no cameras could be recovered from {count} photos: the median photo has {evidence['features']} "
-        f"features, {evidence['matched']} of {evidence['pairs']} pairs match, the best has {evidence['matches']} "
+        f"features, {evidence['matched']} of {evidence['pairs']} pairs match, the best pair has {evidence['matches']} "
         "matches; expected sharp photos of one textured, still scene, each sharing half its view with its neighbours"
     )
 

@@ -29,10 +29,9 @@ MAX_SINGLE_THREAD_PHOTOS = 80
 """Number of photographs up to which matching and mapping run on one thread each, so that their results are
 reproducible.
 
-Mapping on several threads adds in varying order. Matching on several threads multiplies matrices in each of them, by
-the OpenBLAS of pycolmap 4.2, which is built without threads and without locks: two threads may take the same scratch
-memory, and then find wrong neighbours for the features of a photograph, once in some 70 reconstructions on a busy
-machine. Verification of the matches has a thread of its own.
+Mapping on several threads adds in varying order. Matching on several threads multiplies matrices in each of them. The
+OpenBLAS of pycolmap 4.2 is built without locks, so two threads may use the same scratch memory. Then some features are
+matched wrongly, once in about 70 reconstructions on a busy machine. Verification of matches has a thread of its own.
 """
 MIN_OPENCV_PHOTOS = 20
 """Minimum number of photographs of one camera for fitting the eight parameters of OPENCV.

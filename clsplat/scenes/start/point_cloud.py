@@ -127,7 +127,7 @@ def with_cloud_beside(scene: Scene) -> Scene:
 
 
 def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the points (N, 3) that are not outliers, compared with all points and the scene's cameras.
+    """Return a mask (N,) of the points (N, 3) that are not outliers by distance from the middle of the cameras.
 
     where: the file or scene that the points are from, for the warning about outliers.
     """
@@ -146,8 +146,8 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
     """Raise InputError for points (N, 3) of a cloud that do not fit the scene's cameras.
 
-    Either hardly any of them is in a training photograph, or their median distance from the cameras that see them is
-    far from that of the scene's own points.
+    Either hardly any of the points is in a training photograph, or their median distance from the cameras that see them
+    differs much from the distance of the scene's own points.
     """
     sample = _spread(points)
     seen, depths = _seen(sample, scene)

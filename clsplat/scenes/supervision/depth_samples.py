@@ -48,7 +48,7 @@ class KnownDepth:
 
         The results are ascending pixel indices, inverse depths in 1 / world units, and weights, each (k,).
 
-        lens: the lens of the photograph and its depth map. If the camera is not a pinhole, it has the same lens.
+        lens: the lens of the photograph and its depth map. A camera that is not a pinhole has the same lens.
         """
         if self.path is not None:
             nearness = self._from_map(camera, lens)

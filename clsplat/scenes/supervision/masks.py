@@ -88,7 +88,7 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     values or the folder's other masks are dark too.
 
     orient: rotate the mask by its EXIF orientation.
-    invert: exchange the pixels that are kept and those that are not.
+    invert: exchange kept and other pixels.
     """
     image = read_image(path, orient=orient)
     pixels = image[:, :, :3]
@@ -109,7 +109,7 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
 
     A soft mask is returned unchanged if another mask in its folder has values of at least a half.
 
-    values: (H, W, 1), grey values of the mask: means of its colours.
+    values: (H, W, 1), grey values of the mask, 0 to 1: means of its colours.
     pixels: (H, W, 1 or 3), colours of the mask, for the error message.
     Raises InputError for other labels, and for a soft mask if no mask in its folder has values of at least a half.
     """
@@ -144,6 +144,8 @@ def _without_void(path: Path, values: Float32) -> Float32:
 
     The integers are labels if they cover at least the area of white, in this mask or in all masks of its folder. Raises
     InputError for labels other than 0 and 1, and if the meaning is ambiguous.
+
+    values: (H, W, 1), grey values of the mask, 0 to 1.
     """
     most, exact = stored_range(path)
     areas = _areas(values, most)
@@ -167,7 +169,7 @@ def _without_void(path: Path, values: Float32) -> Float32:
 
 
 def _labels(levels: Float32, void: int) -> Float32:
-    """Return a mask's labels with -1 in place of `void`."""
+    """Return a mask's labels `levels` with -1 in place of the label `void`."""
     return np.where(levels == void, np.float32(-1), levels).astype(np.float32)
 
 
@@ -175,6 +177,9 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
     """Return the number of pixels with labels from 1 to MAX_LABEL, and of white pixels, which may be void.
 
     Returns None if the mask has other values than such labels, black and white.
+
+    values: grey values of the mask, 0 to 1.
+    most: integer that the file stores for 1; 0 for a file of floats.
     """
     levels = values * most
     dark = levels < most * MASK_THRESHOLD
@@ -190,8 +195,8 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 def _like(path: Path) -> list[Path]:
     """Return about COMPARED_MASKS evenly spaced masks from the folder of the mask `path`, which may be among them.
 
-    If the name of `path` contains "mask", all files whose names contain it count as masks, otherwise all files whose
-    names do not. This leaves out photographs in the same folder as masks.
+    If `path` has "mask" in its name, the files with "mask" in their names are the masks, otherwise the files without.
+    This leaves out photographs in the same folder.
     """
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
@@ -243,7 +248,8 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict:
     """Find the masks of a scene's photographs, by the photographs' names; none if masks and alpha are not used.
 
     where: the scene, for messages.
-    strict: False if photographs are missing, as their masks may still exist.
+    strict: raise InputError for a mask that fits no photograph. Must be False if photographs are missing: their
+        masks may exist.
     Warns of photographs without a mask. Raises InputError if there are no masks, or one is missing, has another size,
     or fits no photograph.
     """
@@ -289,7 +295,7 @@ def masks_beside(
     """Find masks in a folder next to the photographs' folder or inside it, else next to each photograph.
 
     The keys are the names of the photographs.
-    told: masks that the data set names, by photograph. In nerfstudio's scenes, one mask may serve all photographs.
+    told: masks that the data set names, by photograph. These files are skipped.
     strict: if False, a mask that fits no photograph is skipped, as in `find_masks`.
     others: more names of folders, searched if the usual ones have no masks.
     Raises InputError like `find_masks`.
@@ -319,6 +325,8 @@ def _beside_each(
     """Find masks in a folder inside each photograph's own folder, or in the photograph's folder itself.
 
     In the photograph's folder, only files with "mask" or two extensions in their names are masks.
+
+    told, strict: as for `masks_beside`. folders: names of mask folders.
     """
     by_parent: dict[Path, dict[str, str]] = {}
     for image in images:
@@ -348,6 +356,7 @@ def stage_mask(
 
     path: the mask file, None for all white.
     size: the photograph's width and height.
+    invert: exchange kept and other pixels of the mask file.
     photo: the photograph, if its alpha is a mask too.
     Raises InputError for a mask of another size.
     """
