@@ -76,7 +76,7 @@ def train(
     run : Run, optional
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
-        Continue from the run's latest checkpoint. If False, a run that already has a trained model is refused.
+        Continue from the run's latest checkpoint. If False, a run that has checkpoints or metrics is refused.
     on_step : callable, optional
         Called with a report every 10 steps (`REPORT_EVERY` in `clsplat/training/loop.py`).
     on_plan : callable, optional

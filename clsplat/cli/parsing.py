@@ -196,7 +196,7 @@ def _unboxed(report: str) -> str:
 
 def report(message: str, status: int, arguments: Sequence[str]) -> None:
     """Print an error to standard error. If the command line has --json, also print it as a JSON object to
-    standard output."""
+    standard output. status: the exit status, which goes into this object."""
     tell(f"clsplat: error: {message}")
     if "--json" in arguments:
         print(as_json(message, status), flush=True)

@@ -11,7 +11,9 @@ from clsplat.config.checks import Rule, check_kinds, check_rules
 
 @dataclass(frozen=True)
 class RasterizerConfig:
-    """Approximations of the rasterizer. Values other than the defaults save work and change pictures.
+    """Approximations of the rasterizer.
+
+    Values other than the defaults change pictures, and save work; a lower alpha-min or transmittance-min costs work.
 
     sh-tolerance and sh-storage apply to frames of a model that stays on the device (render, eval), not to training.
     docs/performance.md has the error of each setting, and the time that it saves.

@@ -65,7 +65,7 @@ class Device:
     why: warning that the preferred shape failed and another is used, shown at the first use of the device; usually "".
     only_tries: True while kernels run in the sandbox only, not on this device (`launch.only_tried`).
     waits: True if the host waits for each kernel (SYNC_VARIABLE).
-    shares_memory: True if the device uses the host's memory.
+    shares_memory: True for CPUs, whose kernels read and write the host's arrays in place.
     calls: counts of the calls on its queue.
     command_buffers: the command buffers that are being recorded.
     under_way: events and buffers that keep host arrays alive while the device may still read them.

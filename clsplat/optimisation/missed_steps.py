@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Factors by which late Adam (--optimiser.late) makes up for the steps that a Gaussian missed while out of view.
 
-Steps that Adam refuses, as of values that are not finite: `kernels/shared/adam.h`.
+Steps that Adam refuses, for example because a value is not finite, are another matter: see `kernels/shared/adam.h`.
 """
 
 from __future__ import annotations

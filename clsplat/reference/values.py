@@ -83,7 +83,8 @@ class _Layer:
     raw: alpha before it is limited to `alpha_max`.
     alpha: 0 where the Gaussian is not added.
     before: transmittance in front of the Gaussian.
-    margin: as in `ValuesBlended`.
+    margin: smallest relative distance of this Gaussian's alpha and transmittance from their thresholds; inf in pixels
+        that are finished.
     """
 
     gaussian: int

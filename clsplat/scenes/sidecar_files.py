@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search for sidecar files of photographs, such as masks and depth maps, in a folder next to the photographs'."""
+"""Search for sidecar files of photographs, such as masks and depth maps, in a folder inside or next to the
+photographs' own."""
 
 from __future__ import annotations
 

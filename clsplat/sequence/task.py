@@ -297,14 +297,16 @@ def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
 
 
 def camera_after(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Return the whole frame's camera one frame after the shutter's middle, for motion; None if not requested."""
+    """Return the whole frame's camera one frame after the shutter's middle, for the channel `motion`; None if
+    no channel needs it."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
 def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Return the whole frame's camera one frame before the shutter's middle, for backward; None if not requested."""
+    """Return the whole frame's camera one frame before the shutter's middle, for the channel `backward`; None
+    if no channel needs it."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)

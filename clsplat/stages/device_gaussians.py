@@ -338,7 +338,7 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
 
 
 def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArray[np.float32]:
-    """Return a copy of the rows of `array` with the indices `places`, which are (k,) or a slice."""
+    """Return a copy of the rows of `array` at the indices `places`, which are (k,) or a slice."""
     if isinstance(places, slice):
         return array.get_rows(places.start, places.stop)
     if isinstance(array, StoredArray):
@@ -348,7 +348,7 @@ def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArra
 
 
 def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, values: NDArray[np.float32]) -> None:
-    """Replace the rows of `array` with the indices `places`, which are (k,) or a slice, by `values`."""
+    """Write `values` to the rows of `array` at the indices `places`, which are (k,) or a slice."""
     if isinstance(places, slice):
         array.set_rows(places.start, values)
         return

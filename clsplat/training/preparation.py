@@ -80,10 +80,12 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Record the scene in the run. Returns the scene to train on, whose points have colours. Warns of faults that
-    `sanity_checks.of_scene` finds.
+    """Prepare the scene, and record it and the settings in the run if there is one. Returns the scene to train on.
 
-    Raises InputError if the run has already been trained, or trained on another scene.
+    Unless training continues from a checkpoint, also warn of faults that `sanity_checks.of_scene` finds, and give
+    points without colours the photographs' colours.
+
+    Raises InputError without `resume` if the run has been trained already, and with `resume` if its scene was another.
     """
     scene = prepared(scene, config, run if resume else None)
     if run is not None:

@@ -2,6 +2,7 @@
 """Capabilities of a device by which algorithms are chosen, and CLSPLAT_PRETEND, which overrides them.
 
 With CLSPLAT_PRETEND any machine can test the code paths for GPUs, for small devices and for simple compilers.
+Whether arrays are shared with the host follows from the kind: `Device.shares_memory` of `clsplat/device/context.py`.
 """
 
 from __future__ import annotations

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases, which compare stages with their float64 twins, and the stages of the self-test."""
+"""The cases, each a comparison of a stage with its float64 twin, and the list of the self-test's stages."""
