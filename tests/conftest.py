@@ -34,7 +34,7 @@ from clsplat.device.selection import open_device
 begin_session()
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a run in the background; tests interrupt its children
-# The folders that PoCL and clsplat use by default. Tests that change XDG_CACHE_HOME then do not build every kernel anew.
+# The folders that PoCL and clsplat use by default, so that tests that change XDG_CACHE_HOME do not build kernels anew
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 os.environ.setdefault("POCL_CACHE_DIR", str(CACHE / "pocl" / "kcache"))
 os.environ.setdefault("CLSPLAT_BINARIES", str(CACHE / "clsplat" / "binaries"))

@@ -216,8 +216,8 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
         lines = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
         lines[:, : values.shape[1]] = values
         plane.update(lines)
-    # The code 1 is Rec.709 for the first three, and limited range for color_range. The ProRes encoder writes these codes
-    # to the header of each frame.
+    # The code 1 is Rec.709 for the first three, and limited range for color_range. The ProRes encoder writes these
+    # codes to the header of each frame.
     frame.colorspace = frame.color_primaries = frame.color_trc = frame.color_range = 1
     return frame
 
