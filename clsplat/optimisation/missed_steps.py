@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Factors by which late Adam (--optimiser.late) makes up for the steps that a Gaussian missed while out of view.
 
-Steps that Adam refuses, as of values that are not finite: `kernels/shared/adam.h`.
+Steps that Adam refuses because values are not finite: `kernels/shared/adam.h`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class MissedSteps:
     """Factors for Gaussians that missed the last 0 to MOST_MISSED steps.
 
     groups: names of the parameter groups.
-    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The last axis has a parameter's movement, as a
-        multiple of its first moment over the root of its second, then the factors of the first and second moment.
+    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The last axis has three factors. A parameter
+        moves by minus the first, times its first moment over the root of its second. The others multiply the moments.
     """
 
     def __init__(self, config: OptimiserConfig, groups: Sequence[str], factors: Float64 | None = None) -> None:

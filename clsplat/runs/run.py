@@ -88,7 +88,7 @@ class Run:
 
         resume: continue an existing run with `config` (see `check_resumed`).
         overwrite: remove the files of an existing run, and nothing else.
-        Raises InputError like `check_output` and `locks.locked`.
+        Raises InputError like `check_output`, `check_resumed` and `locks.locked`.
         """
         path = Path(path)
         check_output(path, resume=resume, overwrite=overwrite)
@@ -235,8 +235,8 @@ class Run:
     def manifests(self) -> list[tuple[Path, Manifest]]:
         """Return paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
 
-        Damaged checkpoints are left out, and so are checkpoints after the latest that was found intact. Raises OSError
-        if a checkpoint cannot be read now.
+        Damaged checkpoints are left out, and also all after the latest that this process has written or verified.
+        Raises OSError if a checkpoint cannot be read now.
         """
         found = []
         for step, path in self.checkpoints():
@@ -332,7 +332,11 @@ def run_of(model: Path) -> Run | None:
 
 
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise InputError if a run cannot be created at `path`, or not be resumed there if `resume` is True."""
+    """Raise InputError if a run cannot be created at `path`.
+
+    resume: True to check instead if the run at `path` can be resumed.
+    overwrite: True to allow an existing run, whose files are then replaced.
+    """
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
     if path.exists() and not path.is_dir():

@@ -225,7 +225,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        # the first word of "blake2b" is the digest of the photograph alone, without its mask
+        # the first word of "blake2b" is the digest of the photograph's file, without its mask and known depths
         and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
     reasons = []

@@ -80,9 +80,10 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Record the scene in the run. Returns the scene to train on, whose points have colours. Warns of faults that
-    `sanity_checks.of_scene` finds.
+    """Record the scene in the run. Returns the scene to train on: points without colours get them from the photographs.
+    Warns of faults that `sanity_checks.of_scene` finds.
 
+    resume: True to continue the run from its latest checkpoint.
     Raises InputError if the run has already been trained, or trained on another scene.
     """
     scene = prepared(scene, config, run if resume else None)
@@ -114,7 +115,8 @@ def check_scene(scene: Scene) -> None:
 
 
 def settings_of(config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
-    """Settings of the training. Raises InputError for invalid arguments of `clsplat.train`."""
+    """Settings of the training: `config`, else the run's, else the defaults. Raises InputError for invalid arguments of
+    `clsplat.train`."""
     if not isinstance(config, TrainConfig | None):
         raise InputError(f"config is {config!r:.100}, expected TrainConfig(...)")
     if not isinstance(run, Run | None):

@@ -125,15 +125,15 @@ class Strategy:
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
-        """Return a plan after `model.step` steps, which is carried out when the next step begins."""
+        """Return a plan after `model.step` steps, to be carried out when the next step begins; None changes nothing."""
         raise NotImplementedError
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
-        """Return a plan at the end of step number `model.step`, after Adam's step."""
+        """Return a plan at the end of step number `model.step`, after Adam's step; None changes nothing."""
         return None
 
     def at_end(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
-        """Return a plan for the model at the end of its training."""
+        """Return a plan for the model at the end of its training; None changes nothing."""
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:

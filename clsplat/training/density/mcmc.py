@@ -54,7 +54,7 @@ class Mcmc(Strategy):
 
     def before_step(self, model: ModelState) -> RowPlan:
         """Plan to halve the Gaussians with the largest gradients. Second halves go to rows of dead Gaussians first,
-        then to new rows.
+        then to new rows. Dead Gaussians that are left over are relocated to live ones.
 
         A Gaussian is dead if it is nearly transparent, has no valid rotation, or is too large on the screen.
         """
@@ -99,7 +99,7 @@ class Mcmc(Strategy):
         """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
         2024).
 
-        groups: values of the new model by parameter group, updated in place.
+        groups: parameters of the new model by group, updated in place.
         rows: source rows of the new model's rows, updated in place.
         Returns the rows whose values change.
         """

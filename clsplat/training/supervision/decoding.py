@@ -66,9 +66,10 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Decode view `index` at 1/`factor` of its size. Returns pixels (H, W, C), keyed by the divisor of the size.
+        """Read view `index` at 1/`factor` of its size from `store`, or else decode its file. Returns pixels (H, W, C),
+        keyed by the divisor of the size.
 
-        keeps: True to return larger sizes too, which the training needs later, if the file has to be decoded.
+        keeps: True to return also the larger sizes that the training needs later, if the file has to be decoded.
         Raises PhotographError.
         """
         store = self.store
