@@ -98,7 +98,7 @@ def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int |
 
 
 def device_names(selector: str | None) -> list[str]:
-    """Split `selector` at its commas into names of devices; without it, CLSPLAT_DEVICE. Returns [""] if neither is
+    """Return the names of devices, separated by commas, in `selector` or else in CLSPLAT_DEVICE; [""] if neither is
     given."""
     text = selector or os.environ.get("CLSPLAT_DEVICE") or ""
     return [name.strip() for name in text.split(",") if name.strip()] or [text]

@@ -254,7 +254,7 @@ def stratified_times(count: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Settings of a picture without its channels: colour, framing, sampling, distortion."""
+    """Settings of a picture, except its channels: colour, framing, sampling, distortion."""
 
     colour: ColourConfig = field(default_factory=ColourConfig)
     framing: FramingConfig = field(default_factory=FramingConfig)
@@ -277,7 +277,7 @@ class PictureConfig:
 
 @dataclass(frozen=True)
 class DeepConfig:
-    """Slices of a deep EXR."""
+    """Settings of the slices of a deep EXR."""
 
     bins: int = 16
     """Maximum number of depth slices of a pixel, which are its samples in the file. Each pixel has its own slices, at

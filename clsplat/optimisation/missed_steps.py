@@ -23,8 +23,8 @@ class MissedSteps:
     """Factors for Gaussians that missed the last 0 to MOST_MISSED steps.
 
     groups: names of the parameter groups.
-    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The last axis has three factors. A parameter
-        moves by minus the first, times its first moment over the root of its second. The others multiply the moments.
+    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The last axis has factors a, b and c.
+        In the missed steps, a parameter moves by -a m / (sqrt(v) + epsilon), and its moments m, v become b m, c v.
     """
 
     def __init__(self, config: OptimiserConfig, groups: Sequence[str], factors: Float64 | None = None) -> None:

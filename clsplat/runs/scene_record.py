@@ -170,6 +170,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
 def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
     """Compare the scene read from `path` with the run's recorded scene. Returns True if they differ.
 
+    resolution: value of the setting `resolution`.
     accept: True to accept differences (--accept-changes). Otherwise they raise InputError.
     Another origin of the world always raises InputError, because the model would be displaced.
     """

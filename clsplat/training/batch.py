@@ -394,7 +394,7 @@ class Batch:
         """Add the gradients of a view that a further device has computed to the sums, and the view's other results to
         the density statistics (`probe.after_rows`). Returns the view's loss.
 
-        parameters: the model's parameters, by which a streamed model's rows are added part by part.
+        parameters: the model's parameters. If they are streamed, results are added for a part of the rows at a time.
         outcome: results of the view on the host. They pass through scratch arrays on the first device.
         """
         device, work = step.device, self.rasterizer.work

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of a training: plans of device memory, the limit of main memory (--max-host-mem), scratch files and cache.
 
-A training that is out of memory ends by `TrainingSession.rescue` in `training/loop.py`.
+If memory runs out, `TrainingSession.rescue` in `training/loop.py` writes a checkpoint, and the training ends.
 """
 
 from __future__ import annotations

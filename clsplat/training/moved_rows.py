@@ -31,7 +31,7 @@ class Move:
         rows.
     coefficients: number of SH coefficients after the move; 0 leaves their number unchanged.
     changes: function that is called before the first change of the model.
-    values: values that rows get instead of a copy, in chunks: moments of new Gaussians, and statistics.
+    values: values that are not copied, for a model in chunks: moments of new Gaussians, and statistics.
     """
 
     rows: NDArray[np.uint32] | None = None

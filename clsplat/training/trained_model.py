@@ -120,7 +120,7 @@ class TrainedModel:
             initial = take(initial, space_order(initial.means).astype(np.int64))
         look(initial)
         self.plan = self._make_plan(len(initial))
-        if self.plan.streamed:  # a large model is copied into a store of chunks
+        if self.plan.streamed:  # `set` keeps a small model, but copies a large one into a store of chunks
             initial = initial if len(initial) > ORDERED_ROWS else copy.deepcopy(initial)
             self.set(host_gaussians(initial, self.plan.rows))
         else:
@@ -171,8 +171,8 @@ class TrainedModel:
         return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
-        """Return parameters and moments by kind ("parameters", "first", "second") and parameter group. They are among
-        `arrays` of a checkpoint, or in the scratch file if the checkpoint has only a manifest."""
+        """Return parameters and moments by kind ("parameters", "first", "second") and parameter group. Their
+        values are in `arrays` of a checkpoint, or in the scratch file if the checkpoint has only a manifest."""
         if self.in_file:
             return {kind: model.arrays for kind, model in self.kinds().items()}
         return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}

@@ -271,7 +271,7 @@ class Trainer:
 
     @property
     def complete_parameters(self) -> AnyGaussians:
-        """Parameters with all postponed changes. They may be a copy: reading them changes no bit of the training."""
+        """Parameters with all postponed changes. They may be a copy, so that reading them does not change the model."""
         self.catch_up_exactly()
         parameters = self.parameters
         for component in self.components:

@@ -23,7 +23,7 @@ class Appearance(Component):
         return type(self) is not Appearance
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
-        """Return the part (`ViewPart`) that learns the appearance of each view of a step; () if nothing is learnt.
+        """Return, for each view of a step, the part (`ViewPart`) that learns its appearance; () if nothing is learnt.
 
         views: indices of the step's views among the training views.
         step: number of views that training has used, including the views of this step.

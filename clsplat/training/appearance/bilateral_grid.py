@@ -109,8 +109,7 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes on the device per pixel of the largest picture. They add up to the transformed image, all grids, and
-        the grids' moments."""
+        """Bytes on the device per pixel of the largest picture, for the transformed image and arrays of all grids."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:

@@ -119,8 +119,8 @@ class ViewColours(ViewPart):
         return np.concatenate([gains[:, :GAIN_ENTRIES], logs[:, GAIN_ENTRIES:], *of_lens], axis=1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Remove from the photograph `target`, in place, the colours that its entries and the entries of its lens
-        describe. Returns the render `image`, which is unchanged. size: width and height of both."""
+        """Remove the photograph's own colours from its pixels `target`, in place, by the entries of the photograph and
+        of its lens. Returns the render `image` unchanged. size: width and height of both."""
         develop(self.device, self.model, self.colours, self.lenses, self.taken, target, size)
         return image
 

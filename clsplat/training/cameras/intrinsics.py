@@ -34,7 +34,7 @@ class RefinedLenses:
         self._start, count = first_step(config), len(self._rows)
         self._shares = np.bincount(self._of_view) / len(views)
         self.changes = np.zeros((count, LENS_PARAMETERS))
-        # `descend` works on six parameters. A lens has LENS_PARAMETERS; the moments of the others stay 0.
+        # `descend` works on six parameters. A lens has three of them; the moments of the others stay 0.
         self._first, self._second = np.zeros((count, 6)), np.zeros((count, 6, 6))
         self._visits = np.zeros(count, np.int64)
 

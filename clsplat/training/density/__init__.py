@@ -91,7 +91,7 @@ class RowPlan:
     values: by parameter group, the indices (k,) of new rows whose values change, and their new values (k, ...).
     halves: function that computes values of one half of each split Gaussian. Its arguments are the groups `halved` of
         some split Gaussians, and False for first or True for second halves. It is called for all first halves before
-        the second.
+        any second half.
     halved: parameter groups that `halves` reads.
     changes: by parameter group, a function from values of some rows to the new values of these rows.
     restarted: groups whose moments start at zero in every row.
@@ -148,4 +148,4 @@ class Strategy:
         return {}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the state that `arrays` has returned, from a checkpoint."""
+        """Load the state from a checkpoint. arrays: as the method `arrays` returned them."""

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCMC density control: dead Gaussians are relocated to live ones, and the model grows to a given number.
 
-Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike there, the model grows by halving
-the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). `optimisation.step_noise` has
-the noise of each step. Uses no OpenCL.
-Its settings: `DensityConfig` in `config/training.py`.
+Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike in the paper, the model grows by
+halving the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). The noise of a step is in
+`optimisation.step_noise`, and the settings are `DensityConfig` in `config/training.py`. Uses no OpenCL.
 """
 
 from __future__ import annotations
@@ -146,8 +145,8 @@ def wanted(config: DensityConfig, step: int, count: int) -> int:
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
-    """Return the indices, in rising order, of the `count` largest scores, or of all positive scores if they are
-    fewer."""
+    """Return the indices, in rising order, of the `count` largest positive scores, or of all positive scores if there
+    are fewer."""
     order = np.argsort(-scores, kind="stable")[:count]
     return np.sort(order[scores[order] > 0])
 

@@ -37,7 +37,8 @@ class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for Adam's step `step`. Returns None if the step runs over the whole model instead."""
+        """Make the chunks of `model` (parameters, first and second moments) ready for Adam's step `step`. Returns None
+        if the step runs over the whole model instead."""
 
 
 @dataclass(eq=False)

@@ -93,7 +93,7 @@ class SpeculativeSteps:
         self._most = None
 
     def seen(self, frame: ForwardPass) -> None:
-        """Record the forward pass of a step that has just been launched."""
+        """Record the number of pairs of a step that has just been launched, or how to wait for it."""
         counted = frame.listed.counted
         # exact counts are not kept, because the next step needs the memory of their arrays
         self._counted = counted if counted.arriving is not None else None

@@ -106,8 +106,8 @@ class Missed:
 
 
 class VisibleChunks(Component):
-    """The chunks of a training's model: bounds, the movement of Gaussians since these were measured, and the last step
-    that each chunk has taken.
+    """The chunks of a training's model: their bounds, how far Gaussians may have moved since the measurement of bounds,
+    and the last step that each chunk has taken.
 
     A chunk that a step leaves out has no Gaussian that the view shows. Before a view shows it again, the chunk takes
     the steps that it has missed, and gets the bits that steps over the whole model would give. So no bit of a result
@@ -432,7 +432,7 @@ class VisibleChunks(Component):
             for group in _BOUNDED_GROUPS:
                 with np.errstate(divide="ignore", invalid="ignore"):
                     each = np.abs(first[group][rows]) / np.sqrt(second[group][rows])
-                ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN is 0 / 0
+                ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN is 0 / 0: no gradient yet
         self._limit_movement(largest_resumed_step(self._config.optimiser, ratio, step))
         self._begin(count, step)
 

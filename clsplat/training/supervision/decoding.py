@@ -41,7 +41,7 @@ def stored(image: Float32, *, rounds: bool) -> NDArray[Any]:
     """
     levels = np.rint(image * 255)
     fits = 0 <= levels.min() <= levels.max() <= 255
-    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # target.cl converts in the same way
+    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as target.cl converts back
         return levels.astype(np.uint8)
     return np.ascontiguousarray(image, np.float32)
 
