@@ -2,8 +2,8 @@
 """MCMC density control: dead Gaussians are relocated to live ones, and the model grows to a given number.
 
 Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike in the paper, the model grows by
-halving the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). The noise of a step is in
-`optimisation.step_noise`, and the settings are `DensityConfig` in `config/training.py`. Uses no OpenCL.
+halving the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). The noise of a step is
+in `optimisation.step_noise`, and the settings are `DensityConfig` in `config/training.py`. Uses no OpenCL.
 """
 
 from __future__ import annotations
