@@ -80,7 +80,10 @@ def check_steps(flag: str, steps: tuple[int, ...]) -> None:
 
 
 def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int | None:
-    """Parse "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number to bytes. Raises InputError."""
+    """Parse "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number to bytes. None stays None.
+
+    flag: flag that the text was given by, for the message of InputError.
+    """
     if text is None:
         return None
     match = _BYTE_SIZE_PATTERN.fullmatch(str(text))
@@ -95,6 +98,7 @@ def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int |
 
 
 def device_names(selector: str | None) -> list[str]:
-    """Split `selector`, or else CLSPLAT_DEVICE, into device names at its commas. Returns [""] if neither is given."""
+    """Return the names of devices, separated by commas, in `selector` or else in CLSPLAT_DEVICE; [""] if neither is
+    given."""
     text = selector or os.environ.get("CLSPLAT_DEVICE") or ""
     return [name.strip() for name in text.split(",") if name.strip()] or [text]

@@ -117,7 +117,10 @@ class WarpConfig:
     COLMAP model or a transforms.json."""
 
     def check(self, channels: Collection[str] = ()) -> None:
-        """Raise InputError if both settings are given, or if distortion makes one of `channels` undefined."""
+        """Raise InputError if both settings are given, or if distortion makes a channel undefined.
+
+        channels: names of the channels to render.
+        """
         if self.stmap and self.distort:
             raise InputError("--stmap and --distort exclude each other: both distort the picture")
         flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
@@ -210,8 +213,8 @@ class SamplingConfig:
     def sample_times(self) -> list[float]:
         """Time of each sample, in frames. 0 is the time of the frame.
 
-        The times are spread over the interval in which the shutter is open. Without motion blur all
-        are the middle of this interval.
+        The times are spread over the interval in which the shutter is open. Without motion blur all are the middle of
+        this interval.
         """
         if not self.on or self.samples == 1:
             return [self.middle]
@@ -251,7 +254,7 @@ def stratified_times(count: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Settings of a picture without its channels: colour, framing, sampling, distortion."""
+    """Settings of a picture, except its channels: colour, framing, sampling, distortion."""
 
     colour: ColourConfig = field(default_factory=ColourConfig)
     framing: FramingConfig = field(default_factory=FramingConfig)
@@ -261,7 +264,7 @@ class PictureConfig:
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        whole: True for complete settings; False for flags to which a USD stage may still add the focus.
+        whole: True for complete settings; False for the flags alone, to which a USD stage may still add the focus.
         """
         self.framing.check()
         self.sampling.check(whole=whole)
@@ -274,7 +277,7 @@ class PictureConfig:
 
 @dataclass(frozen=True)
 class DeepConfig:
-    """Slices of a deep EXR."""
+    """Settings of the slices of a deep EXR."""
 
     bins: int = 16
     """Maximum number of depth slices of a pixel, which are its samples in the file. Each pixel has its own slices, at

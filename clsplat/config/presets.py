@@ -95,10 +95,11 @@ def steps_made_for(preset: Preset, schedule: Schedule | None) -> int:
 
 
 def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collection[str] = ()) -> TrainConfig:
-    """Stretch or shorten a schedule to `passes` passes through the training photographs.
+    """Stretch or shorten the schedule in `config` to `passes` passes through the training photographs.
 
     All STEP_SETTINGS are multiplied by the same factor, so that a densification sees the same fraction of the
     photographs, whatever their number. A setting of at least 1 stays at least 1.
+    photographs: number of training photographs.
     given: names of settings that must not change.
     Raises InputError if `passes` is less than 1.
     """

@@ -50,13 +50,13 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """Return these settings as BenchSwitches, with all further switches at their defaults."""
+        """Return these settings as BenchSwitches, with the switches for measurements at their defaults."""
         return BenchSwitches(**vars(self))
 
 
 @dataclass(frozen=True)
 class BenchSwitches(RasterizerConfig):
-    """Settings of the rasterizer, and switches for measurements, which change no bit of a frame.
+    """Settings of the rasterizer, and further switches for measurements. The further switches change no bit of a frame.
 
     docs/performance.md has the error of each setting, and the time that it saves.
     """

@@ -263,8 +263,8 @@ class TrainConfig:
     fewer than 300 training photographs, else 8bit."""
     view_order: ViewOrderKind = "random"
     """Order of the photographs in each pass through all of them. near: clusters of photographs that show the same
-    things, by their positions and viewing directions; four clusters take turns. Then a step
-    shows more of the Gaussians that were in view a few steps before. This may cost some PSNR."""
+    things, by their positions and viewing directions; four clusters take turns. Then a step shows more of the Gaussians
+    that were in view a few steps before. This may cost some PSNR."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
@@ -445,7 +445,7 @@ class TrainConfig:
 
     @property
     def test_views(self) -> tuple[int, int]:
-        """(test_every, test_most), which choose the held-out views."""
+        """The settings (test_every, test_most), by which views are held out."""
         return self.test_every, self.test_most
 
     @property
@@ -473,7 +473,7 @@ class TrainConfig:
         """Return the settings for `count` devices. A batch of 1 becomes one view per device, unless `explicit`.
 
         explicit: True if the batch was given on the command line.
-        Raises InputError for a batch that the devices cannot share evenly.
+        Raises InputError for a batch that the devices cannot share evenly, or if several devices would refine cameras.
         """
         if self.refines and count > 1:
             raise InputError(f"{self._refining}: not supported with {count} devices, expected one")

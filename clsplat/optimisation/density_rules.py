@@ -53,7 +53,8 @@ class MarkRules:
 def edge(holds: Callable[[Float32], Any]) -> float:
     """The largest float32 x for which holds(x) is false. So x > edge is the same as holds(x).
 
-    `holds` must be false for small numbers and true for large numbers. If it is constant, the result is infinite.
+    `holds` must be false for small numbers and true for large numbers. The result is -inf if `holds` is
+    true for all numbers, and inf if it is false for all.
     """
     low, high = _ordered(-inf), _ordered(inf)
     with np.errstate(over="ignore", under="ignore"):

@@ -75,7 +75,8 @@ def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int
 def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> Exploration:
     """Convert weights of penalties: from means over all `count` Gaussians to sums over the visible Gaussians.
 
-    Scales are relative to the scene's length unit (equation (91) of docs/gradients.md).
+    opacity, scale: weights of the mean opacity, and of the mean scale in length units of the scene (equation (91) of
+        docs/gradients.md).
     """
     return Exploration(opacity=opacity / count, scale=scale / (3 * count * length_unit))
 

@@ -143,7 +143,8 @@ def scene_of(path: Path) -> str | None:
 def read_manifest(path: Path) -> Manifest | None:
     """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged.
 
-    Raises OSError if the file cannot be read now. The checkpoint may still be intact, and need its scratch file.
+    Raises OSError if the file cannot be read now. The checkpoint may then be intact all the same, and need its scratch
+    file.
     """
     try:
         return manifest_of(*_part(path, *MANIFEST_ARRAYS))

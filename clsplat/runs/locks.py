@@ -40,7 +40,7 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
     verb: verb of clsplat, such as "train", to name this process in the error of others.
 
     Raises InputError, which names the process that holds the lock, and OSError if no file can be created there.
-    On a file system without locks, the function only warns.
+    On a file system without locks, it warns and holds no lock.
     """
     key = os.path.realpath(folder)
     if key in _held:

@@ -88,7 +88,7 @@ class Run:
 
         resume: continue an existing run with `config` (see `check_resumed`).
         overwrite: remove the files of an existing run, and nothing else.
-        Raises InputError like `check_output` and `locks.locked`.
+        Raises InputError like `check_output`, `check_resumed` and `locks.locked`.
         """
         path = Path(path)
         check_output(path, resume=resume, overwrite=overwrite)
@@ -149,7 +149,7 @@ class Run:
         ply.write_rows(self.model_path, model, count, rows, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
-        """Write the scores of the held-out views, eval.json."""
+        """Write `result`, the scores of the held-out views, to eval.json."""
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
 
     def write_appearance(self, record: Mapping[str, Any], tables: Mapping[str, NDArray[Any]] | None = None) -> None:
@@ -235,8 +235,8 @@ class Run:
     def manifests(self) -> list[tuple[Path, Manifest]]:
         """Return paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
 
-        Damaged checkpoints are left out, and so are checkpoints after the latest that was found intact. Raises OSError
-        if a checkpoint cannot be read now.
+        Damaged checkpoints are left out, and those of later steps than the one that this process last wrote or
+        verified. Raises OSError if a checkpoint cannot be read now.
         """
         found = []
         for step, path in self.checkpoints():
@@ -327,12 +327,17 @@ def is_run(path: Path) -> bool:
 
 
 def run_of(model: Path) -> Run | None:
-    """Return the run that a model belongs to: the folder `model`, or the folder that contains it; None if no run."""
+    """Return the run that a model belongs to: the folder `model`, or the folder that contains it. None if neither is
+    a run."""
     return next((Run.open(path) for path in (model, model.parent) if is_run(path)), None)
 
 
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise InputError if a run cannot be created at `path`, or not be resumed there if `resume` is True."""
+    """Raise InputError if a run cannot be created at `path`.
+
+    resume: True to check instead if the run at `path` can be resumed.
+    overwrite: True to allow an existing run, whose files are then replaced.
+    """
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
     if path.exists() and not path.is_dir():

@@ -170,6 +170,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
 def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
     """Compare the scene read from `path` with the run's recorded scene. Returns True if they differ.
 
+    resolution: value of the setting `resolution`.
     accept: True to accept differences (--accept-changes). Otherwise they raise InputError.
     Another origin of the world always raises InputError, because the model would be displaced.
     """
@@ -225,7 +226,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        # the first word of "blake2b" is the digest of the photograph alone, without its mask
+        # the first word of "blake2b" is the digest of the photograph's file, without its mask and known depths
         and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
     reasons = []

@@ -46,7 +46,8 @@ class ScratchFiles:
         return self.folder / f"{self._owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
 
     def is_own(self, path: Path) -> bool:
-        """True if only this training can need `path`: the name begins with `owner`, or it is in the run's scratch/."""
+        """True if only this training can need the file `path`: its name begins with `owner`, or it is in the run's
+        scratch/."""
         inside = self._run is not None and path.parent == (self._run.path / "scratch").absolute()
         return path.name.startswith(self._owner) or inside
 
@@ -55,7 +56,8 @@ class ScratchFiles:
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
-        """Protect the slots in the store's file that checkpoints need. Report the file's speed on a network disk."""
+        """Protect the slots in the store's file that checkpoints need. From now on, also warn if `folder` is on a
+        network disk."""
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count

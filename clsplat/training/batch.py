@@ -90,7 +90,7 @@ class Losses:
 
 @dataclass(eq=False)
 class _AddedView(GradientStep):
-    """Step of one view that adds the view's gradients to the batch's sums, in place of Adam.
+    """Step of one view that adds the view's gradients to the batch's sums, instead of taking Adam's step.
 
     The `model` that it runs on consists of the parameters and the batch's sums of gradients, without moments.
 
@@ -134,7 +134,7 @@ class ViewOutcome:
 
 @dataclass(eq=False)
 class _RemoteView(GradientStep):
-    """Step of one view on a further device, which copies the view's results to the host, in place of Adam."""
+    """Step of one view on a further device. It copies the view's results to the host, instead of taking Adam's step."""
 
     arrays: dict[str, NDArray[Any]]
     outcome: dict[str, NDArray[np.float32]]
@@ -212,7 +212,7 @@ class Replica:
 
         place: the view's position among this device's views of the batch.
         factor: divisor of the photographs' resolution.
-        step: step of a view on the first device. The view on this device is computed with its settings.
+        step: the step of the batch's views on the first device, from which this device takes all settings.
         values: parameters of each of `inputs.parts`, as `ViewPart.values` returned them.
         splats: True to return splats and screen-space gradients too, which density control uses.
         """
@@ -245,7 +245,7 @@ class Replica:
 
 
 class Batch:
-    """Steps of several views: gradients of the views on all devices, and Adam's step along their sum.
+    """Steps of several views: the devices compute the views' gradients, and Adam takes one step with their sum.
 
     rasterizer, photographs: rasterizer and image cache of the device that has the model.
     further: the other devices.
@@ -326,7 +326,7 @@ class Batch:
                 outcome = future.result()
                 losses.append(self._take(model[0], sums, outcome, step_of_view, probes(views[index], step_of_view)))
                 own[index] = [None if each is None else upload(device, each) for each in outcome.own]
-        finally:  # after an error no thread may go on with the batch
+        finally:  # after an error, no thread may still be working on this batch
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
         for start, _, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
@@ -354,7 +354,7 @@ class Batch:
 
     def _send(self, parameters: AnyGaussians) -> list[Future[None]]:
         """Begin to send the parameters to the further devices, without the higher SH bands if these are unchanged.
-        Returns the transfers, to be waited for."""
+        Returns the transfers, for which the caller has to wait."""
         if not self.replicas:
             return []
         groups = [group for group in PARAMETER_GROUPS if group != "sh_rest" or self._sent is not parameters]
@@ -391,11 +391,11 @@ class Batch:
     def _take(
         self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
     ) -> Loss:
-        """Add to the sums the gradients that a further device computed, and its other results to the density
-        statistics, by way of scratch arrays on the first device. Returns the view's loss.
+        """Add the gradients of a view that a further device has computed to the sums, and the view's other results to
+        the density statistics (`probe.after_rows`). Returns the view's loss.
 
-        parameters: the model's parameters. A streamed model comes to the device in parts, each with the density
-            statistics of its rows.
+        parameters: the model's parameters. If they are streamed, results are added for a part of the rows at a time.
+        outcome: results of the view on the host. They pass through scratch arrays on the first device.
         """
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)

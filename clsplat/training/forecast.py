@@ -193,7 +193,7 @@ class Forecast:
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
     """Growth of the model by the densification at step `step`, as a fraction of the peak growth, by the paper's rule.
 
-    peak: step of the largest growth so far. Before it, growth does not decay, whatever the density settings say.
+    peak: step of the densification that has added most so far. Growth does not decay before this step.
     """
     index = step // density.every - density.start // density.every - 1
     if index < len(GROWTH_RAMP):

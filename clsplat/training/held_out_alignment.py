@@ -34,7 +34,8 @@ class _FixedModel(GradientStep):
 def aligned(trainer: Trainer, view: View, look: Look) -> Camera:
     """Camera of a held-out view, moved so that the model fits the view's photograph best. The model does not change.
 
-    look: function that gives a render the view's appearance. That appearance is removed from the photograph.
+    look: function of a view's name and a render. It gives the render the view's appearance, by which the photograph is
+        divided here, so that it can be compared with the model's own colours.
     """
     config, rasterizer, model = replace(trainer.config, thinning=0.0), trainer.rasterizer, trainer.parameters
     photograph = np.ascontiguousarray(view.load_masked())

@@ -248,12 +248,12 @@ class TrainingSession:
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
     def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Render the current model over the background of evaluations. Returns its image and alpha."""
+        """Render the current model over the background of evaluations. Returns image and alpha."""
         result = self.trainer.draw(camera)
         return result.image, result.alpha
 
     def render(self, model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Render a model on the host. Returns its image, over black, and alpha."""
+        """Render `model`, which is in main memory or in a file, over black. Returns image and alpha."""
         result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
         return result.image, result.alpha
 
@@ -283,8 +283,8 @@ class TrainingSession:
     ) -> None:
         """Pass a step's report to `on_step`, and append it to metrics.jsonl, with other values that report.html shows.
 
-        evaluating: True to evaluate the held-out views.
-        stages: milliseconds by stage, if the step was timed.
+        evaluating: True to evaluate the held-out views for the record.
+        stages: milliseconds by stage; None if the step was not timed.
         validated: True if the refined cameras have been validated after the step.
         """
         if self.on_step is not None:
@@ -360,7 +360,7 @@ class TrainingSession:
     def train(self, between: Between | None) -> Gaussians:
         """Run the remaining steps, and write the model and its evaluation. between: function called before each step.
 
-        Raises InputError, after a checkpoint, for a photograph that cannot be read.
+        For a photograph that cannot be read, writes a checkpoint and raises InputError.
         """
         try:
             return self._train(between)
@@ -433,8 +433,8 @@ class TrainingSession:
 
 
 def _tell_of_limit(trainer: Trainer) -> None:
-    """Warn if --density.max-gaussians has limited the growth by the paper's rule, unless training began above the
-    limit."""
+    """Warn if --density.max-gaussians has limited the growth of --density.growth paper, unless training began above
+    the limit."""
     density, scene = trainer.config.density, trainer.scene
     most, began = GROWTH_LIMIT_FRACTION * density.max_gaussians, len(scene.points) or trainer.config.random_points
     if not density.fills and began < most <= trainer.parameters.count:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of a training: plans of device memory, the limit of main memory (--max-host-mem), scratch files and cache.
 
-A training that is out of memory ends by `TrainingSession.rescue` in `training/loop.py`.
+If memory runs out, `TrainingSession.rescue` in `training/loop.py` writes a checkpoint, and the training ends.
 """
 
 from __future__ import annotations
@@ -132,8 +132,8 @@ class HostMemory:
             self.share(photographs, count, taken, begins=True)
 
     def pool(self, photographs: HostPhotographs, count: int, record: int, *, begins: bool) -> int | None:
-        """Return the bytes of main memory for the pool of a streamed model, if the device shares main memory; None if
-        all chunks fit within the limit.
+        """Return the bytes for the pool of a streamed model on a device that shares main memory. None if all chunks fit
+        within the limit, or if there is no limit.
 
         count, record: number of Gaussians, and bytes of a Gaussian in a chunk.
         begins: True to raise InputError if the limit is too small for one chunk.
@@ -172,7 +172,7 @@ class HostMemory:
         """Limit photographs to the memory that the Gaussians leave. Returns False if the photographs need more.
 
         count, taken: number of Gaussians, and their bytes on the host.
-        begins: True to raise InputError instead. The message names the smallest limit that is enough.
+        begins: True to raise InputError in this case, with the smallest limit that is enough.
         """
         if self.limit is None:
             return True
@@ -237,7 +237,7 @@ class MemoryPlanner:
         self.begins, self._warned, self.rows_in_view = True, False, 0
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
-        """Set `rows_in_view` to the largest number of rows of the initial model that one view shows.
+        """Set `rows_in_view` to the largest number of rows in the chunks of the initial model that one view may show.
 
         Only an even sample of the views is counted. The number is 0 if device memory has no limit, or if a model of
         this size is never streamed by chunk.
@@ -285,20 +285,20 @@ class MemoryPlanner:
             self._batch.follow([self._plan(each, count, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in replicas])
         return made
 
-    def plan_view(self, made: Plan, chunks: int) -> Plan:
+    def plan_view(self, current: Plan, chunks: int) -> Plan:
         """Plan the device's memory for views that show up to `chunks` chunks.
 
-        made: the present plan, by which the model is streamed by chunk. It is returned if it has room for so many
-            chunks, or if an earlier view has shown as many. It stays valid after a CapacityError.
+        current: the current plan of a model that is streamed by chunk. It is returned if it has room for `chunks`
+            chunks, or if memory was planned for as many before. After a CapacityError it stays valid.
         """
         device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
-        if rows <= max(self.rows_in_view, made.rows):
-            return made
+        if rows <= max(self.rows_in_view, current.rows):
+            return current
         try:  # plan for a few more chunks, so that slightly larger views need no new plan
             padded = CHUNK_ROWS * listed_chunks(chunks)
-            wider, rows = plan_view(device, made, padded), padded
+            wider, rows = plan_view(device, current, padded), padded
         except CapacityError:
-            wider = plan_view(device, made, rows)
+            wider = plan_view(device, current, rows)
         self.rows_in_view = rows
         self._rasterizer.follow(wider)
         self._share_host(wider, wider.need.gaussians)
@@ -332,7 +332,7 @@ class MemoryPlanner:
         if need.pool is not None:
             taken = need.record * plan.rows
         elif plan.streamed and need.held is not None and self.scratch_files is not None:
-            taken *= not self._memory.is_exceeded(taken, photographs)  # if so, all chunks go to a scratch file
+            taken *= not self._memory.is_exceeded(taken, photographs)  # a scratch file then takes all chunks
         enough = self._memory.share(photographs, count, taken, begins=self.begins)
         if not enough and not self._warned:
             self._warned = True

@@ -70,8 +70,12 @@ class MipFilter(Component):
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load the scales' lower limits from a checkpoint. Raises ValueError unless it has one limit for each of the
-        `count` Gaussians."""
+        """Load the scales' lower limits, if the checkpoint has any. Raises ValueError unless there is a limit for each
+        of the `count` Gaussians.
+
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        step: step of the checkpoint; not used.
+        """
         least = named("sampling/").get("least") if self.on else None
         if least is not None and least.shape != (count,):
             raise ValueError(f"sampling/least has shape {least.shape}, expected ({count},)")

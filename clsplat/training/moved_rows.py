@@ -31,7 +31,7 @@ class Move:
         rows.
     coefficients: number of SH coefficients after the move; 0 leaves their number unchanged.
     changes: function that is called before the first change of the model.
-    values: initial values of new Gaussians, and of arrays that the old chunks do not have.
+    values: values that are not copied, for a model in chunks: moments of new Gaussians, and statistics.
     """
 
     rows: NDArray[np.uint32] | None = None
@@ -129,7 +129,7 @@ def halve(
             set_rows_at(parameters[group], both(first, second), np.concatenate([values, sides[1][group]]))
         return
     for places, begin in product((first, second), range(0, moved.halves // 2, at_once)):
-        # The second halves are read as copies of the split Gaussians. They are replaced after all first halves.
+        # The rows of the second halves keep copies of the split Gaussians until all first halves are written.
         copies, some = (some_of(each, begin, at_once) for each in (second, places))
         split = {group: rows_at(parameters[group], copies) for group in halved}
         for group, values in halves(split, places is second).items():

@@ -116,7 +116,7 @@ def largest_contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECOND
         np.maximum(largest, sums_of_weights(rasterizer, frame), out=largest)
         looked += 1
         if looked == 1:
-            start = time.perf_counter()  # without the first view, which may have built kernels
+            start = time.perf_counter()  # do not count the first view, which may have built kernels
         elif time.perf_counter() - start > seconds:
             break
     return largest, looked

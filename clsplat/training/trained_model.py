@@ -120,7 +120,7 @@ class TrainedModel:
             initial = take(initial, space_order(initial.means).astype(np.int64))
         look(initial)
         self.plan = self._make_plan(len(initial))
-        if self.plan.streamed:  # a large model is copied into a store of chunks
+        if self.plan.streamed:  # `set` keeps a small model, but copies a large one into a store of chunks
             initial = initial if len(initial) > ORDERED_ROWS else copy.deepcopy(initial)
             self.set(host_gaussians(initial, self.plan.rows))
         else:
@@ -137,7 +137,7 @@ class TrainedModel:
         self.plan = self._make_plan(count)
         for name, array in arrays.items():
             if array.shape != (count,) or (isinstance(array, np.ndarray) and array.dtype != np.float32):
-                raise unusable(checkpoint, f"{KIND}/{name} has shape {array.shape}")
+                raise unusable(checkpoint, f"{KIND}/{name} has shape {array.shape}, expected float32 of ({count},)")
         if not self._go_on_in(checkpoint.manifest, models[0].coefficients):
             held = {name: HostArray(each) if isinstance(each, np.ndarray) else each for name, each in arrays.items()}
             self._place(models, held)
@@ -150,8 +150,8 @@ class TrainedModel:
     def set(
         self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
     ) -> None:
-        """Replace the model, on the device or the host as the plan assigns, with new statistics. Moments that are not
-        given are zero."""
+        """Replace the model, and begin new statistics. The plan decides if the model goes to the device or to the host.
+        Moments that are not given are zero."""
         self._place((parameters, first, second), {})
 
     def kinds(self) -> dict[str, AnyGaussians]:
@@ -171,8 +171,8 @@ class TrainedModel:
         return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
-        """Return parameters and moments by kind ("parameters", "first", "second") and parameter group. They are among
-        `arrays` of a checkpoint, or in the scratch file if the checkpoint has only a manifest."""
+        """Return parameters and moments by kind ("parameters", "first", "second") and parameter group. Their
+        values are in `arrays` of a checkpoint, or in the scratch file if the checkpoint has only a manifest."""
         if self.in_file:
             return {kind: model.arrays for kind, model in self.kinds().items()}
         return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}
@@ -404,7 +404,7 @@ class TrainedModel:
 
     def _before_view(self, chunks: int) -> None:
         """Plan the memory for a step whose view shows `chunks` chunks. Make the pool smaller if the view's arrays need
-        its memory. No bit of a result depends on the pool's size. Raises CapacityError, before any change, and
+        some of its memory. No bit of a result depends on the pool's size. Raises CapacityError, before any change, and
         WriteError."""
         assert self._pool is not None
         self.plan = self._plan_view(self.plan, chunks)

@@ -95,7 +95,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # batches and refinement wait for the device
+        self.pending.on &= self.batch is None and not config.refines  # batches and refinement wait for each step
         self._start()
 
     def _start(self) -> None:
@@ -271,7 +271,7 @@ class Trainer:
 
     @property
     def complete_parameters(self) -> AnyGaussians:
-        """Parameters with all postponed changes. They may be a copy: reading them changes no bit of the training."""
+        """Parameters with all postponed changes. They may be a copy, so that reading them does not change the model."""
         self.catch_up_exactly()
         parameters = self.parameters
         for component in self.components:
@@ -370,7 +370,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.position.queue:
             self.position.queue = self.order.next_pass(self.position.rng)
-            if self.batch is None:  # a batch has views of the last epoch whose contributions are not added yet
+            if self.batch is None:  # in a batch, views of the last epoch have not added their contributions yet
                 self._turn_epoch()
                 self._note(begun=True)
         return self.position.queue.pop()
@@ -383,8 +383,8 @@ class Trainer:
         self.model.statistics = self.statistics.next_epoch()
 
     def _raise_sh_degree(self) -> None:
-        """Raise the SH degree in use, by adding coefficients of zero to the model. Before, higher bands have no arrays,
-        because their gradients would be zero."""
+        """Raise the SH degree in use when due, by adding coefficients of zero to the model. Bands above the degree in
+        use have no arrays."""
         every = self.config.sh_degree_every
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2

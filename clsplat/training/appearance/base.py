@@ -23,7 +23,7 @@ class Appearance(Component):
         return type(self) is not Appearance
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
-        """Return the part (`ViewPart`) that learns the appearance of each view of a step; () if nothing is learnt.
+        """Return, for each view of a step, the part (`ViewPart`) that learns its appearance; () if nothing is learnt.
 
         views: indices of the step's views among the training views.
         step: number of views that training has used, including the views of this step.
@@ -31,7 +31,11 @@ class Appearance(Component):
         return ()
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Return `inputs`, with the appearance of each view added to its parts."""
+        """Return `inputs`. Each view has the part that learns its appearance in addition to its other parts.
+
+        step: number of views that training has used, including the views of this step.
+        count: number of Gaussians; not used.
+        """
         shares = self.of_views([each.view for each in inputs], step)
         if not shares:
             return inputs
@@ -49,11 +53,13 @@ class Appearance(Component):
         """Load the appearance from a checkpoint. Raises ValueError for arrays of other photographs.
 
         named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        step, count: step and number of Gaussians of the checkpoint; not used.
         """
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the appearance from a checkpoint. arrays: arrays by name, without the prefix "appearance/"."""
+        """Load the appearance from a checkpoint's `arrays`, by name without "appearance/". Raises ValueError for arrays
+        of other photographs."""
 
     def write(self, run: Run) -> None:
         """Write `record` as appearance.json and `tables` as appearance.npz into the run's folder; nothing if `record`

@@ -64,15 +64,18 @@ class ViewGrid(ViewPart):
         return self.grids.grids.get_rows(self.view, self.view + 1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Return the render `image`, with the colour changes of the photograph's grid."""
+        """Return the render `image`, of width and height `size`, with the colour changes of the photograph's grid. The
+        photograph `target` is not changed."""
         return apply_grid(self.device, work, self.grids, self.view, image, *size)
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Compute the loss's gradient with respect to the grid, and return it.
+        """Return the loss's gradient with respect to the grid.
 
-        gradient: with respect to the result of `compare` at first; then, in place, with respect to `image`.
+        image: the render before `compare`. size: its width and height.
+        gradient: the loss's gradient with respect to the result of `compare`. It is replaced, in place, by the gradient
+            with respect to `image`.
         At the grid's first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
         of_view = (self.grids, self.view, image, gradient)
@@ -87,6 +90,7 @@ class ViewGrid(ViewPart):
         identity: a colour change that all photographs share belongs to the model.
 
         own: gradient with respect to the grid, as the method `gradient` returned it.
+        readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
         """
         assert own is not None, "made by `gradient`"
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
@@ -105,13 +109,15 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes on the device per pixel of the largest picture: of a transformed image, and a share of the grids'
-        arrays."""
+        """Bytes on the device per pixel of the largest picture, for the transformed image and arrays of all grids."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:
-        """Return the part of each view of a step that learns and applies its grid. Each pass shows every view once.
+        """Return, for each view of a step, the part that learns and applies the view's grid.
 
+        Each pass shows every view once, so the number of a step gives the number of visits to its view.
+
+        views: indices of the step's views among the training views.
         step: number of views that training has used, including the views of this step.
         """
         count = self._count

@@ -119,8 +119,8 @@ class ViewColours(ViewPart):
         return np.concatenate([gains[:, :GAIN_ENTRIES], logs[:, GAIN_ENTRIES:], *of_lens], axis=1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Remove the photograph's own colours, as its entries and its lens's describe them, from the photograph
-        `target`, in place. Returns the render `image`, which is unchanged."""
+        """Remove the photograph's own colours from its pixels `target`, in place, by the entries of the photograph and
+        of its lens. Returns the render `image` unchanged. size: width and height of both."""
         develop(self.device, self.model, self.colours, self.lenses, self.taken, target, size)
         return image
 
@@ -129,6 +129,7 @@ class ViewColours(ViewPart):
     ) -> DeviceArray:
         """Return the loss's gradient with respect to the entries, as column sums (`entry_gradient`), for `update`.
 
+        image: the render, of width and height `size`. gradient: the loss's gradient with respect to it.
         At the first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
         columns = entry_gradient(self.device, work, self.model, self.taken, image, gradient, size, self.place)
@@ -141,6 +142,7 @@ class ViewColours(ViewPart):
         """Take Adam's step for the entries of the photograph and of its lens.
 
         own: gradient with respect to the entries, as the method `gradient` returned it.
+        readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
         """
         assert own is not None, "made by `gradient`"
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
@@ -161,13 +163,15 @@ def panorama(view: View) -> bool:
     return view.camera.model.wraps
 
 
-def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
-    """Subtract the mean of the known exposures in `of` from the exposures in `told`. Unknown exposures become NaN.
+def _from_mean(exposures: Sequence[float | None], reference: Sequence[float | None]) -> NDArray[np.float64]:
+    """Subtract the mean of the known exposures in `reference` from `exposures`. Unknown exposures become NaN.
 
-    told, of: exposures from EXIF in octaves (`exposure_of`); None if unknown.
+    exposures, reference: exposures from EXIF in octaves (`exposure_of`); None if unknown.
     """
-    known = [value for value in of if value is not None]
-    return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
+    known = [value for value in reference if value is not None]
+    return np.array(
+        [np.nan if value is None or not known else value - np.mean(known) for value in exposures], np.float64
+    )
 
 
 def _named(sizes: Mapping[str, int], entries: NDArray[np.float64]) -> dict[str, list[float]]:
@@ -197,8 +201,9 @@ class ColoursOfAll(Appearance):
 
     @cached_property
     def _gains(self) -> Gains:
-        """Entries of all training photographs. Their gains begin at gains from points or from EXIF. They are computed
-        on first use, because sampling the photographs takes time, and not at all if a checkpoint is loaded before."""
+        """Entries of all training photographs. The gains among them begin at gains from points or from EXIF. The
+        entries are computed on first use, because sampling the photographs takes time, and a checkpoint may replace the
+        result."""
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
@@ -225,8 +230,9 @@ class ColoursOfAll(Appearance):
         return self._model.pixel_bytes
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewColours]:
-        """Return the part of each view of a step that learns and applies its entries.
+        """Return, for each view of a step, the part that learns and applies the photograph's and the lens's entries.
 
+        views: indices of the step's views among the training views.
         step: number of views that training has used, including the views of this step.
         """
         numbers = range(step - len(views) + 1, step + 1)

@@ -30,9 +30,9 @@ NEIGHBOUR_WEIGHT_STEP = 2.0**-20
 
 
 def places(cameras: Sequence[Camera]) -> Float64:
-    """Return points (n, 6), to measure distances between cameras: a camera's position relative to the middle
-    of all positions, in units of the median distance from there, and its viewing direction. If all positions differ
-    only by rounding, they count as equal."""
+    """Return points (n, 6) whose distances say how near cameras are to each other: position and viewing direction of
+    each camera. Positions are relative to their middle, in units of the median distance from it. If all positions
+    differ only by rounding, they count as equal."""
     centres = np.array([camera.position for camera in cameras])
     apart = centres - np.median(centres, axis=0)
     extent = float(np.median(np.linalg.norm(apart, axis=1)))
@@ -47,10 +47,11 @@ def common(cameras: Sequence[Camera], told: NDArray[np.bool_]) -> csr_array:
     told: (n,), True for photographs that have gains from points; rows and columns of all others are 0.
 
     For a photograph with many neighbours the matrix keeps nearly all of the common part. For a photograph without
-    neighbours it keeps half of the value. Its entries are w / sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance
-    of r times NEIGHBOUR_DISTANCE_LIMIT. t and t' are 1 plus the sum of w over a photograph's neighbours, itself
-    included. These w are positive definite in six dimensions (Wendland, Advances in Computational Mathematics 4, 1995).
-    So the matrix is positive semidefinite, except for rounding to `NEIGHBOUR_WEIGHT_STEP`.
+    neighbours it keeps half of the value. The matrix's entries are w / sqrt(t t'). The weight w is (1 - r)^6 (6 r + 1)
+    for two cameras at a distance of r times NEIGHBOUR_DISTANCE_LIMIT. For each of the two photographs, t or t' is 1
+    plus the sum of w over its neighbours, itself included. As a function of distance, w is positive definite in six
+    dimensions (Wendland, Advances in Computational Mathematics 4, 1995). So the matrix is positive semidefinite, except
+    for rounding to `NEIGHBOUR_WEIGHT_STEP`.
     """
     numbers = np.flatnonzero(told)
     if not len(numbers):

@@ -34,7 +34,7 @@ class RefinedLenses:
         self._start, count = first_step(config), len(self._rows)
         self._shares = np.bincount(self._of_view) / len(views)
         self.changes = np.zeros((count, LENS_PARAMETERS))
-        # `descend` works on six parameters. A lens has three of them; the others stay 0.
+        # `descend` works on six parameters. A lens has three of them; the moments of the others stay 0.
         self._first, self._second = np.zeros((count, 6)), np.zeros((count, 6, 6))
         self._visits = np.zeros(count, np.int64)
 
@@ -45,6 +45,7 @@ class RefinedLenses:
     def move(self, view: int, step: int, camera: Camera, gradient: Float64) -> None:
         """Take Adam's step for the lens of training view `view`. A gradient that is not finite causes no step.
 
+        step: number of the training step, by which the learning rate falls.
         camera: the camera with which the gradient was computed.
         gradient: (4,), with respect to ln fx, ln fy, cx and cy.
         """

@@ -47,7 +47,7 @@ def fallen(reach: float, part: float, visits: float) -> float:
 
 
 def first_step(config: TrainConfig) -> int:
-    """Return the last step number before cameras are refined: until then the model is too coarse to align them."""
+    """Return the number of the step after which cameras are refined. Before, the model is too coarse to align them."""
     return min(500, config.iterations // 10)
 
 
@@ -88,15 +88,15 @@ def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
     return np.diagonal(a).copy(), axes
 
 
-def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64:
+def descend(first: Float64, second: Float64, gradient: Float64, visit: int) -> Float64:
     """Adam's step (6,) at rate 1, in the axes of the gradients' second moments: equation (143) of docs/gradients.md.
 
     first, second: moments (6,) and (6, 6), updated in place.
-    by: the gradient (6,).
+    gradient: (6,).
     visit: number of steps that the camera has taken, including this step.
     """
-    first += (1 - POSE_BETA1) * (by - first)
-    second += (1 - POSE_BETA2) * (by[:, None] * by - second)
+    first += (1 - POSE_BETA1) * (gradient - first)
+    second += (1 - POSE_BETA2) * (gradient[:, None] * gradient - second)
     mean = first / (1 - POSE_BETA1**visit)
     squares, axes = axes_of(second / (1 - POSE_BETA2**visit))
     least = max(MIN_AXIS_MOMENT_RATIO * squares.max(), MIN_AXIS_MOMENT)
@@ -108,10 +108,10 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
 class Poses:
     """Cameras of the training views, which move if poses are refined.
 
-    Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view,
-    and the view farthest from it. Outlier cameras are not among the two.
+    Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view
+    whose camera is not an outlier, and the view farthest from it among such views.
 
-    held: indices of these two views.
+    held: indices of the two views that do not move; empty if poses are not refined.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[View], length_unit: float) -> None:
@@ -143,13 +143,14 @@ class Poses:
     def move(self, view: int, step: int, gradient: Float64) -> None:
         """Take Adam's step for the pose of training view `view`. A gradient that is not finite causes no step.
 
+        step: number of the training step, by which the learning rate falls.
         gradient: (6,), with respect to the camera's rotation and translation, as `Camera.moved` defines them.
         """
-        by = gradient * self._scale  # translations relative to the length unit
-        if not np.isfinite(by).all():
+        scaled = gradient * self._scale  # translations relative to the length unit
+        if not np.isfinite(scaled).all():
             return
         self._visits[view] += 1
-        down = descend(self._first[view], self._second[view], by, int(self._visits[view]))
+        down = descend(self._first[view], self._second[view], scaled, int(self._visits[view]))
         self.cameras[view] = self.cameras[view].moved(self.rate(step) * self._scale * down)
 
     def motions(self) -> tuple[Float64, Float64]:

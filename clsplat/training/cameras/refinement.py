@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Camera refinement: gradients with respect to poses and lenses, and validation of cameras on held-out views.
 
-The first step of a refinement: `first_step` in `training/cameras/poses.py`.
+The step after which cameras are refined: `first_step` in `training/cameras/poses.py`.
 """
 
 from __future__ import annotations
@@ -179,7 +179,10 @@ class Cameras(Component):
         return 4 * LENS_NUMBERS * self._config.refine_lenses
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """Return the views. Each view whose pose or lens this step refines has a `CameraSums` among its parts."""
+        """Return the views. Each view whose pose or lens this step refines has a `CameraSums` among its parts.
+
+        step, count: number of the step's last view, and number of Gaussians.
+        """
         if self.gate.ended is not None or not self._config.refines:
             return inputs
         return [self._joined(each, step, count) for each in inputs]
@@ -243,7 +246,11 @@ class Cameras(Component):
         return self.refined_arrays() | self.gate.arrays()
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load refined cameras and the gate's measurements. Raises ValueError for a checkpoint of other views."""
+        """Load refined cameras and the gate's measurements. Raises ValueError for a checkpoint of other views.
+
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        step, count: step and number of Gaussians of the checkpoint; not used.
+        """
         self.poses.load(named("poses/"))
         self.lenses.load(named("lenses/"))
         self.gate.load(named("gate/"), self.refined_arrays())

@@ -112,7 +112,7 @@ class CameraGate:
         self._best: dict[str, NDArray[Any]] = {}
 
     def is_due(self, step: int) -> bool:
-        """True if the cameras have to be validated after step number `step`, or an earlier validation was skipped."""
+        """True if a validation is due after step number `step`, or was due earlier and has been skipped."""
         last = self.measured[-1][0] if self.measured else -1
         return any(last < due <= step for due in self._steps)
 

@@ -91,7 +91,7 @@ class RowPlan:
     values: by parameter group, the indices (k,) of new rows whose values change, and their new values (k, ...).
     halves: function that computes values of one half of each split Gaussian. Its arguments are the groups `halved` of
         some split Gaussians, and False for first or True for second halves. It is called for all first halves before
-        the second.
+        any second half.
     halved: parameter groups that `halves` reads.
     changes: by parameter group, a function from values of some rows to the new values of these rows.
     restarted: groups whose moments start at zero in every row.
@@ -125,15 +125,15 @@ class Strategy:
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
-        """Return a plan after `model.step` steps, which is carried out when the next step begins."""
+        """Return a plan after `model.step` steps, to be carried out when the next step begins; None changes nothing."""
         raise NotImplementedError
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
-        """Return a plan at the end of step number `model.step`, after Adam's step."""
+        """Return a plan at the end of step number `model.step`, after Adam's step; None changes nothing."""
         return None
 
     def at_end(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
-        """Return a plan for the model at the end of its training."""
+        """Return a plan for the model at the end of its training; None changes nothing."""
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
@@ -148,4 +148,4 @@ class Strategy:
         return {}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the state that `arrays` has returned, from a checkpoint."""
+        """Load the state from a checkpoint. arrays: as the method `arrays` returned them."""

@@ -176,7 +176,7 @@ def weakest(scores: Float32, count: int) -> tuple[float, int]:
         if equal <= len(rows):
             return float(value), begin + int(rows[equal - 1])
         equal -= len(rows)
-    raise AssertionError("one of the scores is the last one")
+    raise AssertionError(f"the scores have NaN, or are fewer than {count}")
 
 
 def budget(config: DensityConfig, step: int, count: int) -> int:
@@ -255,7 +255,7 @@ def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, 
 def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
     """Rotate offsets (m, 3) by quaternions (m, 4) from the Gaussians' own axes to the world's."""
     q = quaternions.astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # zero quaternions are never rendered
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # zero stays zero; such a Gaussian is never drawn
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
     turned: Float64 = offsets + w * twice + np.cross(axis, twice)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCMC density control: dead Gaussians are relocated to live ones, and the model grows to a given number.
 
-Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike there, the model grows by halving
-the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). `optimisation.step_noise` has
-the noise of each step. Uses no OpenCL.
-Its settings: `DensityConfig` in `config/training.py`.
+Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike in the paper, the model grows by
+halving the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). The noise of a step is
+in `optimisation.step_noise`, and the settings are `DensityConfig` in `config/training.py`. Uses no OpenCL.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Mcmc(Strategy):
 
     def before_step(self, model: ModelState) -> RowPlan:
         """Plan to halve the Gaussians with the largest gradients. Second halves go to rows of dead Gaussians first,
-        then to new rows.
+        then to new rows. Dead Gaussians that are left over are relocated to live ones.
 
         A Gaussian is dead if it is nearly transparent, has no valid rotation, or is too large on the screen.
         """
@@ -99,7 +98,7 @@ class Mcmc(Strategy):
         """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
         2024).
 
-        groups: values of the new model by parameter group, updated in place.
+        groups: parameters of the new model by group, updated in place.
         rows: source rows of the new model's rows, updated in place.
         Returns the rows whose values change.
         """
@@ -146,8 +145,8 @@ def wanted(config: DensityConfig, step: int, count: int) -> int:
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
-    """Return the indices, in rising order, of the `count` largest scores, or of all positive scores if they are
-    fewer."""
+    """Return the indices, in rising order, of the `count` largest positive scores, or of all positive scores if there
+    are fewer."""
     order = np.argsort(-scores, kind="stable")[:count]
     return np.sort(order[scores[order] > 0])
 

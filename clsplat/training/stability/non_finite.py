@@ -85,7 +85,7 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record the last step if `adam` refused elements in it. The loss of this step is then read.
+        """Record the last step if `adam` refused elements in it. Its loss is then read too, as it may be at fault.
 
         refused: numbers of elements that `adam` did not update, one for each reason of `REFUSED`.
         """
@@ -101,7 +101,7 @@ class NonFiniteMonitor:
         self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:
-        """Record a non-finite loss, which `adam` does not report if no Gaussian is broken."""
+        """Record a non-finite loss. `adam` does not report it if all gradients of Gaussians are finite."""
         if self.last is not None and self._noticed is None:
             self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
 

@@ -79,8 +79,7 @@ class Component:
         """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make the postponed changes to parameters and moments, but only if their bits do not depend on when they are
-        made."""
+        """Make those postponed changes to parameters and moments whose bits do not depend on when they are made."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all postponed changes to parameters and moments. Called when every row is needed."""
@@ -107,7 +106,7 @@ class Component:
     def load(self, named: Named, step: int, count: int) -> None:
         """Load the state from a checkpoint of `count` Gaussians after `step` views. Raises ValueError for other views.
 
-        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix (`Named`).
         """
 
     def write(self, run: Run) -> None:

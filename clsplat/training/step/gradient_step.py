@@ -59,14 +59,14 @@ class StepProbe:
         """Observe the pairs' gradients, after the gradient of blending has been launched."""
 
     def before_replay(self) -> None:
-        """Called before a command buffer with the launches of Adam is replayed, which changes the model."""
+        """Called before the replay of a command buffer that launches Adam, so before the model changes."""
 
     def before_rows(self, rows: StepRows) -> None:
         """Observe rows of the model, on which Adam is about to be launched."""
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Observe rows of the model, after Adam on them has been launched. In a batch of views, after the gradients of
-        one view have been added."""
+        """Observe rows of the model, after Adam has been launched on them. In a batch, this is called for each view,
+        after its gradients have been added to the sums."""
 
 
 NO_PROBE = StepProbe()
@@ -162,6 +162,7 @@ class GradientStep:
         of: parameters of the model.
         sent: camera and background on the device.
         source: the photograph on the device.
+        terms: terms of the loss in addition to L1 and D-SSIM.
         chunks: the chunks in view; None for the whole model.
         """
         camera = inputs.camera
@@ -212,7 +213,8 @@ class GradientStep:
         frame: ForwardPass,
         terms: Sequence[LossTerm],
     ) -> Loss:
-        """Return the loss between a frame and the photograph `source`. of: parameters of the model in the frame."""
+        """Return the loss between a frame and the photograph `source`, with L1, D-SSIM and `terms`. of: parameters of
+        the model in the frame."""
         work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
@@ -276,8 +278,8 @@ class GradientStep:
     def _parts(
         self, model: tuple[AnyGaussians, ...], projected: Projected, chunks: ChunkList | ChunkNumbers | None
     ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected]]:
-        """Yield the parts of the model that are on the device at a time. Each has the number of its first row, the
-        part's rows of all arrays of the model, and the projection of these rows."""
+        """Yield the parts in which the model comes to the device. A part is the number of its first row, its rows of
+        each array of the model, and their projection."""
         work = self.rasterizer.work
         if isinstance(chunks, ChunkNumbers):
             for start, stop, part, slots in chunk_parts(work, chunks, *model, changes=True):

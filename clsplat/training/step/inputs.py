@@ -23,9 +23,9 @@ from clsplat.stages.project import Projected, Screen, Slots
 class PlacedChunks:
     """Chunks that a step runs over, ready for its kernels.
 
-    model: arrays for the kernels: of the whole model, or of the pool of a streamed model.
-    in_model: usually a `ChunkList`: the chunks' numbers in the whole model, or their slots in the pool. If the pool has
-        too few slots for all chunks, it is a `ChunkNumbers`. Then `model` is the streamed model, whose chunks come to
+    model: the arrays that the kernels get: those of the whole model, or of the pool if the model is streamed.
+    in_model: a `ChunkList`: the chunks' numbers in the whole model, or their slots in the pool. If the pool has too few
+        slots for all chunks, `in_model` is a `ChunkNumbers`, and `model` is the streamed model, whose chunks come to
         the pool in parts.
     """
 
@@ -37,7 +37,8 @@ class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for Adam's step `step`. Returns None if the step runs over the whole model instead."""
+        """Make the chunks of `model` (parameters, first and second moments) ready for Adam's step `step`. Returns None
+        if the step runs over the whole model instead."""
 
 
 @dataclass(eq=False)
@@ -50,7 +51,7 @@ class ViewInputs:
     camera: the view's camera, of the photograph's size.
     begins: True if an epoch begins with this view.
     kept: number of pixels that the view's mask keeps; None without a mask.
-    depth: depth loss with the view's known depths; None if they are not known.
+    depth: depth loss with the view's known depths; None without --depth.
     area: number of pixels at full resolution per pixel of `photograph`.
     place: the view's position in the step.
     parts: the parts that components have in the view.
@@ -78,7 +79,7 @@ class ViewRows:
     rows of some chunks, one chunk after the other.
 
     projected: projection of the rows [start, stop) into the step's view.
-    screen: screen-space gradients of these rows. They may be undefined until the kernel has run that changes the rows.
+    screen: screen-space gradients of these rows. They may be undefined until the kernel that changes the rows has run.
     """
 
     start: int
@@ -94,8 +95,8 @@ class StepRows(ViewRows):
     model: parameters of the rows, then the arrays that the step changes too: moments, or sums of gradients.
     device: the device, with the kernels for the view's projection.
     camera_array, slots: the step's camera on the device, and the gradients of the rows' pairs.
-    gradients: gradients with respect to the rows' parameters, if requested.
-    by_lens: (rows, 4), gradients with respect to the view's lens.
+    gradients: gradients with respect to the rows' parameters; None if nothing reads them.
+    by_lens: (rows, 4), gradients with respect to the view's lens; None if lenses are not refined.
     """
 
     model: tuple[DeviceGaussians, ...]
@@ -136,6 +137,7 @@ class ViewPart:
         """Match the colours of image and photograph: return another image, or change `target` in place.
 
         target: the photograph. It is planes (3 or 4, rows, stride) if any part of the view has `changes_target`.
+        size: width and height of both in pixels, without padding.
         Returns the image to compare.
         """
         return image
@@ -147,7 +149,11 @@ class ViewPart:
         gradient: DeviceArray,  # noqa: ARG002
         size: tuple[int, int],  # noqa: ARG002
     ) -> DeviceArray | None:
-        """Convert dL/d(compared image) to dL/d(image), in place. Returns the gradient for the part's own parameters."""
+        """Return the gradient with respect to the part's own parameters. In place, convert `gradient` from the gradient
+        with respect to the result of `compare` to the one with respect to `image`.
+
+        size: width and height of the image in pixels, without padding.
+        """
         return None
 
     def lens_gradients(self, rows: int) -> DeviceArray | None:  # noqa: ARG002

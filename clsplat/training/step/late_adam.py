@@ -28,7 +28,7 @@ _GROUPS = tuple(PARAMETER_GROUPS)
 
 
 class LateAdam(Component):
-    """Component for late Adam: keeps the last step that each Gaussian took, and factors by which it takes missed steps.
+    """Component for late Adam. It keeps the last step that each Gaussian took, and factors for taking missed steps.
 
     step: number of the last step launched.
     """
@@ -44,8 +44,7 @@ class LateAdam(Component):
 
     @property
     def row_bytes(self) -> int:
-        """Device memory in bytes per Gaussian: the component stores for each the number of the last step that the
-        Gaussian took."""
+        """Bytes per Gaussian on the device: the number of the last step that the Gaussian took."""
         return 4
 
     def is_due(self, step: int, views: int) -> bool:
@@ -57,7 +56,10 @@ class LateAdam(Component):
         return (step - views) % MOST_MISSED == 0
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Return the views, each with a part that settles the Gaussians that the view shows."""
+        """Return the views, each with a part that settles the Gaussians that the view shows.
+
+        step, count: number of the step's last view, and number of Gaussians; not used.
+        """
         return [replace(each, parts=(*each.parts, _ShownRows(self))) for each in inputs]
 
     def settle_shown(self, rows: StepRows, step: AdamStep) -> None:
@@ -118,6 +120,8 @@ class LateAdam(Component):
         """Continue from a checkpoint's arrays. If it has no arrays of late Adam, continue as if all rows had taken
         every step.
 
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        step, count: step and number of Gaussians of the checkpoint.
         Raises ValueError for arrays of another model or step.
         """
         saved, missed = named("late/"), MissedSteps(self._config, _GROUPS)

@@ -17,7 +17,7 @@ def alpha_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:
 
 
 def depth_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:  # noqa: ARG001
-    """Return the depth loss, if the view has known depths; otherwise None."""
+    """Return the depth loss of the view; None if the settings ask for no depths."""
     return inputs.depth
 
 

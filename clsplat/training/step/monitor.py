@@ -21,7 +21,7 @@ from clsplat.training.step.speculative_steps import SpeculativeSteps
 class StepMonitor(StepProbe):
     """Probe of a step, which finds non-finite values and adds the view's statistics for density control.
 
-    It also launches each kernel that changes the model in the sandbox before its first use.
+    Before the first use of a kernel that changes the model, it also launches the kernel in the sandbox.
 
     number: number of views that training has used so far, including the views of this step.
     needs: the statistics that this step gathers for density control.
@@ -69,8 +69,8 @@ class StepMonitor(StepProbe):
         self.changes()
 
     def before_rows(self, rows: StepRows) -> None:
-        """Try in the sandbox every kernel that changes the state, because a driver may fail in any of them. Then tell
-        the trainer that the model is about to change."""
+        """Try in the sandbox every kernel that changes the model or the statistics, because a driver may fail in any of
+        them. Then tell the trainer that the model is about to change."""
         step, parameters = self.step, rows.parameters
         size = (rows.stop - rows.start, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)

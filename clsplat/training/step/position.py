@@ -15,7 +15,7 @@ from clsplat.training.stability.health import RetryBudget
 
 @dataclass
 class Mark:
-    """Copy of a `Position` at which a checkpoint is possible, with the state of the random generator."""
+    """Copy of a `Position` and of the random generator's state, at a point where a checkpoint can be written."""
 
     step: int
     rng: Mapping[str, Any]
@@ -83,6 +83,6 @@ class Position:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state cannot be read ({why})") from None
         self.step, self.last_views = checkpoint.step, last_views
-        self.queue = queue if max(queue, default=0) < views else []  # with fewer views begin a new epoch
+        self.queue = queue if max(queue, default=0) < views else []  # if there are fewer views now, begin an epoch
         self.controlled = bool(checkpoint.state.get("controlled", False))
         return retries

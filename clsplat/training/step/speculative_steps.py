@@ -93,9 +93,9 @@ class SpeculativeSteps:
         self._most = None
 
     def seen(self, frame: ForwardPass) -> None:
-        """Record the forward pass of a step that has just been launched."""
+        """Record the number of pairs of a step that has just been launched, or how to wait for it."""
         counted = frame.listed.counted
-        # exact counts are not kept, because the next step uses their memory
+        # exact counts are not kept, because the next step needs the memory of their arrays
         self._counted = counted if counted.arriving is not None else None
         if self._counted is None:
             self._count(counted.pairs if len(frame.bands) == 1 else None)
@@ -109,6 +109,8 @@ class SpeculativeSteps:
         The capacity is a quarter more than the largest number of pairs of earlier steps with photographs of this
         `size`, multiplied by the growth to `gaussians` Gaussians. It is 0 if steps are not launched by capacity, if no
         earlier number is known, or if it would exceed the rasterizer's capacity.
+
+        size: any value that differs between sizes, and is compared only for equality.
         """
         if not self.on or not rasterizer.takes_room:
             return 0

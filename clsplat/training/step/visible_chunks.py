@@ -106,8 +106,8 @@ class Missed:
 
 
 class VisibleChunks(Component):
-    """The chunks of a training's model: bounds, the movement of Gaussians since these were measured, and the last step
-    that each chunk has taken.
+    """The chunks of a training's model: their bounds, how far Gaussians may have moved since the measurement of bounds,
+    and the last step that each chunk has taken.
 
     A chunk that a step leaves out has no Gaussian that the view shows. Before a view shows it again, the chunk takes
     the steps that it has missed, and gets the bits that steps over the whole model would give. So no bit of a result
@@ -133,10 +133,10 @@ class VisibleChunks(Component):
         self._limit_movement(largest_step(config.optimiser))
         self._begin(count, 0)
 
-    def _limit_movement(self, step: float) -> None:
-        """Set the limit of a parameter's movement in one step, as a multiple of the learning rate."""
-        self._step_limit = step
-        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, step)
+    def _limit_movement(self, limit: float) -> None:
+        """Set the limit of a parameter's movement in one step of Adam, as a multiple of the learning rate."""
+        self._step_limit = limit
+        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, limit)
 
     def _begin(self, count: int, step: int, chunks: int = 0) -> None:
         """Forget all bounds. The model has `count` Gaussians, and all have taken step number `step`.
@@ -149,7 +149,7 @@ class VisibleChunks(Component):
         self._unmeasured = np.ones(chunks, np.bool_)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
-        # twice as many steps as chunks may miss, so that the rows of the table are seldom moved
+        # room for twice as many steps as a chunk may miss, so that the table's rows seldom have to be moved
         most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
@@ -159,7 +159,10 @@ class VisibleChunks(Component):
         self._caught: DeviceArray | None = None
 
     def _divide(self, pool: ChunkPool | None) -> None:
-        """Forget all bounds and missed steps if the number of chunks has changed because rows have moved."""
+        """Forget all bounds and missed steps if the number of chunks has changed because rows have moved.
+
+        pool: pool of a streamed model; None for a model on the device.
+        """
         chunks = chunks_of(self._count) if pool is None else pool.store.chunks
         if chunks != len(self._last):
             self._begin(self._count, self.step, chunks)
@@ -181,7 +184,7 @@ class VisibleChunks(Component):
 
     @property
     def reads_all_rows(self) -> bool:
-        """True if a chunk has missed so many steps that all are caught up before the next measurement of bounds."""
+        """True if some chunk has missed so many steps that all chunks are caught up before bounds are next measured."""
         return self.step - int(self._last.min(initial=self.step)) >= MOST_MISSED_STEPS
 
     def before_step(self, gaussians: AnyGaussians) -> None:
@@ -221,7 +224,10 @@ class VisibleChunks(Component):
         return bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """Return the step's only view, with the chunks that it may show."""
+        """Return the step's only view, with the chunks that it may show.
+
+        step, count: number of the step, and number of Gaussians.
+        """
         if count <= ORDERED_ROWS or self._since is None:
             return inputs
         (of_view,) = inputs
@@ -243,10 +249,10 @@ class VisibleChunks(Component):
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
     def after_adam(self, gaussians: AnyGaussians) -> None:  # noqa: ARG002
-        """Cull the chunks for the next step, as the host has time while the device computes the step just launched.
+        """Find the chunks that the next step's view may show, while the device still computes the step just launched.
 
-        A chunk may have moved less until then, or its bounds may be measured, so a later culling may find fewer chunks.
-        The bits are the same.
+        Before the next step, limits of movement may shrink and bounds may be measured. The chunks found here may then
+        be more than that step needs, which changes no bit of its result.
         """
         camera, step = self._next_camera(), self.step + 1
         self._ahead.clear()
@@ -312,7 +318,7 @@ class VisibleChunks(Component):
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
         """Catch up the chunks that a step's view shows, and send their list. A repeated step gives the same bits."""
-        if chunks.of_rows is not self._found:  # rows have moved, and all rows have taken every step
+        if chunks.of_rows is not self._found:  # rows have moved since, after all chunks were caught up
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
             chunks = _ChunksInView(self, everything, None, self._found, whole=True)
@@ -340,7 +346,8 @@ class VisibleChunks(Component):
         if self._config.optimiser.sparse:
             return
         if step.number - self._first_step >= len(self._table):
-            oldest = min(int(last.min()) for last in (self._last, *self._before.values()))  # a step may be repeated
+            # a repeated step begins with the value of `_last` in `_before`
+            oldest = min(int(last.min()) for last in (self._last, *self._before.values()))
             past = oldest + 1 - self._first_step
             self._table[:-past] = self._table[past:].copy()
             self._first_step += past
@@ -413,8 +420,11 @@ class VisibleChunks(Component):
         self._begin(listed.shape[0], self.step)
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Begin without bounds at a checkpoint. Its moments, perhaps from other decay rates, limit the movement per
-        step."""
+        """Continue from a checkpoint of `count` Gaussians after `step` steps, without bounds. Its moments may come from
+        other decay rates, so they are read for the limit of a parameter's movement in one step.
+
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        """
         first, second = named("first/"), named("second/")
         ratio = 0.0
         for begin in range(0, count, _ROWS_AT_ONCE):
@@ -422,7 +432,7 @@ class VisibleChunks(Component):
             for group in _BOUNDED_GROUPS:
                 with np.errstate(divide="ignore", invalid="ignore"):
                     each = np.abs(first[group][rows]) / np.sqrt(second[group][rows])
-                ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN: both are 0
+                ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN is 0 / 0: no gradient yet
         self._limit_movement(largest_resumed_step(self._config.optimiser, ratio, step))
         self._begin(count, step)
 

@@ -134,7 +134,7 @@ class DecodedStore:
                 )
 
     def _count(self, nbytes: int, seconds: float) -> None:
-        """Count bytes that were read or written, and add a warning if the folder is on a slow network disk."""
+        """Count bytes that were read or written in `seconds`, and note a warning if the folder is on a network disk."""
         with self._lock:
             if note := self._rate.count(nbytes, seconds):
                 self._notes.append(note)

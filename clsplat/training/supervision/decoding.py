@@ -41,7 +41,7 @@ def stored(image: Float32, *, rounds: bool) -> NDArray[Any]:
     """
     levels = np.rint(image * 255)
     fits = 0 <= levels.min() <= levels.max() <= 255
-    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # target.cl converts in the same way
+    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as target.cl converts back
         return levels.astype(np.uint8)
     return np.ascontiguousarray(image, np.float32)
 
@@ -66,9 +66,10 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Decode view `index` at 1/`factor` of its size. Returns pixels (H, W, C), keyed by the divisor of the size.
+        """Read view `index` at 1/`factor` of its size from `store`, or else decode its file. Returns pixels (H, W, C),
+        keyed by the divisor of the size.
 
-        keeps: True to return larger sizes too, which the training needs later, if the file has to be decoded.
+        keeps: True to return also the larger sizes that the training needs later, if the file has to be decoded.
         Raises PhotographError.
         """
         store = self.store

@@ -41,7 +41,8 @@ class DepthTargets(Component):
     """Known depths of all training views at one resolution; inactive unless the settings ask for depths.
 
     near: near plane of the model, in world units.
-    pixels: function that returns a view's photograph (H, W, 3 to 5) at the step's size, on the host.
+    pixels: function from a view's index to its photograph (H, W, 3 to 5) at the step's size, on the host. If it is
+        None, `join` adds no depths.
     """
 
     def __init__(
@@ -72,7 +73,10 @@ class DepthTargets(Component):
         return DEPTH_PIXEL_BYTES if self._config.depth_use else 0
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Return the views, with their known depths."""
+        """Return the views, with their known depths.
+
+        step, count: number of the step's last view, and number of Gaussians.
+        """
         if not self._config.depth_use or self._pixels is None:
             return inputs
         aims = [self.aims(each.view, each.camera, step, self._pixels(each.view)) for each in inputs]
@@ -81,8 +85,9 @@ class DepthTargets(Component):
     def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthTerm | None:
         """Depth loss of a view, with its known depths at the size of `camera`; None if the settings ask for no depths.
 
-        photograph: the view's photograph (H, W, 3 to 5). Its fifth channel is a mask; the loss leaves out depths of
-        masked-out pixels.
+        step: number of the step, by which the weight of the loss falls.
+        photograph: the view's photograph (H, W, 3 to 5). Where its fifth channel, the mask, is 0, the loss leaves out
+            known depths. None leaves out none.
         """
         if not self._config.depth_use:
             return None

@@ -33,7 +33,7 @@ class HostPhotographs:
 
     Without a limit, every photograph that was used stays, also in the sizes that the training needs later. With a
     limit, only the current size is kept, of as many photographs as fit. The most recently used ones are evicted first,
-    because the next epoch needs them last.
+    because no step of this epoch needs them again.
 
     at_once: number of views that a step uses.
     """
@@ -97,12 +97,14 @@ class HostPhotographs:
         return made[factor]
 
     def replace(self, index: int, factor: float, image: NDArray[Any]) -> None:
-        """Keep these pixels of view `index` at 1/factor of its size in place of the file's, until they are evicted."""
+        """Keep `image` as the pixels of view `index` at 1/factor of its size, instead of the file's, until it is
+        evicted."""
         with self._lock:
             self._keep((index, factor), image)
 
     def has_all(self, factor: float) -> bool:
-        """True if all photographs are in memory at 1/factor of their size, so that nothing has to be read ahead."""
+        """True if all photographs are in memory at 1/factor of their size, so that nothing has to be read ahead. With a
+        limit it is always False."""
         if self._room is not None or factor == self._complete:
             return self._room is None
         with self._lock:

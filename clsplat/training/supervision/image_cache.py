@@ -73,7 +73,7 @@ class ImageCache:
         image = self.load(index, factor)
         if self._device.shares_memory:
             array = shared(self._device, image)
-            if not self.host.bounded:  # with a limit, `host` may evict the image
+            if not self.host.bounded:  # else `host` may evict the image to free its memory
                 self._on_device[index] = array
             return array
         if self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
