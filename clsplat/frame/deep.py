@@ -40,7 +40,10 @@ _WARP_BATCH_PIXELS = 1 << 14
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-    """Render the slices (bins, H, W, 5) of a camera's picture by depth. The camera may have a window."""
+    """Render the slices (bins, H, W, DEEP_FLOATS) of a camera's picture by depth. The camera may have a window.
+
+    bins: maximum number of slices per pixel.
+    """
     larger, rows, columns = on_tiles(camera)
     return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
 
@@ -49,6 +52,7 @@ def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins
     """Return a function (`DrawDeep`) that renders deep pictures with the kernels.
 
     gaussians: function that returns the model; it is called only when the picture is drawn.
+    bins: maximum number of slices per pixel.
     """
     return lambda camera: render_deep(renderer, gaussians(), camera, bins).transpose(0, 3, 1, 2)
 
@@ -79,7 +83,10 @@ def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
 
 
 class Merge:
-    """Weighted mean of deep pictures on the device, with weights for each pixel. Colours must be linear."""
+    """Weighted mean of deep pictures on the device, with weights for each pixel. Colours must be linear.
+
+    bins: maximum number of slices per pixel.
+    """
 
     def __init__(self, device: Device, bins: int) -> None:
         self.bins, self._device, self._work = bins, device, Workspace(device)
@@ -116,7 +123,7 @@ class Merge:
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
     """Return a function (`DrawDeep`) that renders the mean of deep pictures over samples of shutter and lens.
 
-    Its argument is a camera, of which it uses only size and window.
+    The returned function uses only size and window of its camera.
 
     draws, cameras: for each sample, the function that renders it (`DrawDeep`) and its camera of the whole frame.
     """
@@ -132,7 +139,7 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
     """Return a function (`DrawDeep`) that renders warped deep pictures.
 
-    Its argument is a camera, of which it uses only size and window. A pixel is the mean of slices at `Warp.samples` by
+    The returned function uses only size and window of its camera. A pixel is the mean of slices at `Warp.samples` x
     `Warp.samples` positions. Interpolation is bilinear, because the negative weights of a cubic filter would give
     invalid slices. Pixels in which nothing is visible have no slices.
     """
@@ -151,9 +158,12 @@ def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
 
 
 def _around(straight: Float32, places: Float64) -> Iterator[Weighted]:
-    """Yield the four pixels around each position, with their bilinear weights.
+    """Yield pictures (h, w) with weights: the four pixels around each sample's position, one picture for each of them.
 
-    places: positions (h, samples, w, samples, 2), NaN where nothing is visible.
+    The weights are bilinear, divided by the number of samples in a pixel.
+
+    straight: planes of the undistorted picture.
+    places: positions (h, samples, w, samples, 2) in this picture, NaN where nothing is visible.
     """
     height, width = straight.shape[2:]
     samples = places.shape[1]

@@ -44,9 +44,11 @@ def write_deep(
     """Draw and write a deep scanline EXR, atomically. Returns True if the picture is empty.
 
     Channels are R, G, B, A, Z and ZBack. A pixel has at most `bins` slices; each is a sample at a single depth.
-    `convert` gives colours in the file's colour space. `encoding` makes them half or float; depths are float. The
-    picture is drawn in strips of `rows` rows, to limit the memory. Raises InputError and ClsplatError like
-    `images.frame_files.write_channels`.
+    Raises InputError and ClsplatError like `images.frame_files.write_channels`.
+
+    rows: number of rows of the strips in which the picture is drawn, to limit the memory.
+    encoding: stores colours as half or float; depths are always float.
+    convert: function that converts colours to the file's colour space; None leaves them unchanged.
     """
     encoding, header = encoding or Encoding(), header or FrameFileHeader()
     if path.suffix.lower() != ".exr":
@@ -76,6 +78,7 @@ def _samples(
     """The number of samples in each pixel (h, w), and the samples' values by channel, pixel after pixel.
 
     slices: planes (bins, DEEP_FLOATS, h, w) of a few rows.
+    convert: as for `write_deep`. half: True stores colours as half floats.
     """
     _, floats, height, width = slices.shape
     planes = np.ascontiguousarray(slices.swapaxes(0, 1)).reshape(floats, -1)
@@ -89,4 +92,5 @@ def _samples(
     light = [*(rgb if convert is None else convert(rgb[None], alpha[None])[0]).T, alpha]
     if half:
         light = [np.clip(values, -MAX_HALF_FLOAT, MAX_HALF_FLOAT).astype(np.float16) for values in light]
-    return counts, dict(zip(DEEP_CHANNELS, [*light, depth, depth], strict=True))  # a slice has a single depth
+    # depth is in the file twice, as Z and ZBack, because a slice has a single depth
+    return counts, dict(zip(DEEP_CHANNELS, [*light, depth, depth], strict=True))

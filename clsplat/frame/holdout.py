@@ -25,7 +25,7 @@ class Cut:
     def __call__(self, camera: Camera) -> Surfaces | None:
         """The holdout surfaces of each pixel of the picture, with depths as in the kernels; None if no pixel has any.
 
-        A pixel gets the surfaces of the holdout's pixel that contains its top left corner.
+        A pixel's top left corner decides: its surfaces are those of the holdout's pixel that contains this corner.
         """
         window, holdout = camera.window, self._holdout
         x, y, across, down = (

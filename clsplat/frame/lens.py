@@ -155,10 +155,11 @@ class Warp:
         return max(JACOBIAN_CLAMP_HALF_FRAMES, float((2 * beyond / size).max()))
 
     def of_window(self, camera: Camera) -> tuple[Float64, Camera | None]:
-        """Positions (k height, k width, 2) in the undistorted frame of a warped picture's samples, and a camera whose
-        window contains them.
+        """Return where the samples of a warped picture are in the undistorted frame, and a camera whose window contains
+        them.
 
-        k is `samples`. The camera is None if nothing is visible.
+        camera: camera of the warped picture; only its size and window matter.
+        The positions are (k height, k width, 2), with k = `samples`. The returned camera is None if nothing is visible.
         """
         x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
         samples = self.samples
@@ -177,6 +178,7 @@ class Warp:
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
     """Return positions (height, width, 2) of a distorted picture's pixels in the undistorted picture.
 
+    lens: lens of the distorted picture. straight: camera of the undistorted picture.
     NaN where a pixel has no ray.
     """
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
@@ -188,6 +190,7 @@ def distorted_places(lens: Lens, straight: Camera) -> Float64:
 def undistorted_places(lens: Lens, straight: Camera) -> Float64:
     """Return positions (height, width, 2) of an undistorted picture's pixels in the distorted picture.
 
+    lens, straight: as for `distorted_places`.
     NaN where the lens does not show the pixel.
     """
     x = (np.arange(straight.width) + 0.5 - straight.cx) / straight.fx

@@ -58,7 +58,7 @@ class FrameRequest:
 
     at: function that returns the camera of the whole frame, in its final size, at a time in frames; 0 is this frame.
     after, before: cameras of the next and the previous frame, for the channels motion and backward.
-    lens: lens distortion, as the position in an undistorted picture of each pixel; None for an undistorted frame.
+    lens: mapping from the distorted frame to an undistorted frame; None for a frame without distortion.
     sampling: settings of this frame's samples of shutter and lens; None uses the job's settings.
     cut: function from a camera to the holdout surfaces in its picture; None without a holdout.
     models: function from a time to the Gaussians; None uses the pipeline's model.
@@ -77,7 +77,7 @@ class FrameRequest:
 
 
 def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
-    """Return a step (`Pass`) that applies `apply` to the drawing function (`Draw`) of each time."""
+    """Return a `Pass` that applies `apply` to the drawing function (`Draw`) of each time."""
     return lambda draw: lambda time: apply(draw(time))
 
 
@@ -176,6 +176,7 @@ class FramePipeline:
     def draw_deep(self, bins: int, frame: FrameRequest) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
         """Prepare a deep frame, as `draw` prepares a flat one.
 
+        bins: maximum number of slices per pixel.
         Returns three functions: the first renders the frame, the second converts its colours to the file's colour
         space, and the third gives the number of rows of a strip for a camera.
         """

@@ -136,8 +136,9 @@ def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callab
     """Return a function (`Draw`) whose rgb and alpha are means over samples. Other channels cannot be averaged and come
     from the middle camera.
 
+    The returned function uses only size and window of its camera.
+
     middle, cameras: cameras of whole frames.
-    The function's argument is a camera, of which it uses only size and window.
     light: function from a sample's number to the sample's `Draw`; None uses `draw` for all samples.
     `draw` must return rgb in linear light. Sums are float64, in the order of the cameras.
     """

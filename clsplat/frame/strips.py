@@ -32,7 +32,7 @@ def strip_rows(
     camera: Camera,
     names: Collection[str] = ("rgb",),
     config: FramingConfig | None = None,
-    planes: int = 0,
+    extra_bytes: int = 0,
 ) -> int:
     """Number of rows of a strip, a multiple of the tile size, that leaves memory for the model and its pairs.
 
@@ -40,10 +40,10 @@ def strip_rows(
 
     names: names of the channels to render.
     config: the framing; with supersampling, rendered strips are larger than written strips.
-    planes: bytes per pixel that the frame needs in addition to its channels, such as for a holdout.
+    extra_bytes: bytes per pixel that the frame needs in addition to its channels, such as for a holdout.
     """
     samples = config.supersample if config else 1
-    most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
+    most = min(frame_pixels(device, feature_floats(names), extra_bytes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
     rows = most // across - 2 * TILE  # two tiles spare: windows may begin inside a tile, and filters read margins
     if rows >= camera.height:
@@ -92,7 +92,7 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
     """Raise InputError if an EXR file of several parts or views would have to be written in strips.
 
-    Such a file stores one whole part or view after the other, and so cannot be written from strips that have them all.
+    Such a file stores one whole part or view after the other, but each strip has rows of all parts and views.
 
     views: number of views in the file, 2 for a stereo pair.
     """

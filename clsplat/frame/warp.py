@@ -26,7 +26,7 @@ _SAMPLE_ROWS_PER_BATCH = 128
 def warped(draw: Draw, warp: Warp) -> Draw:
     """Return a function (`Draw`) that renders warped pictures.
 
-    Its argument is a camera, of which it uses only size and window. `draw` renders windows of the undistorted frame,
+    The returned function uses only size and window of its camera. `draw` renders windows of the undistorted frame,
     with rgb in linear light. A pixel's rgb and alpha are means of `Warp.samples` x `Warp.samples` samples, interpolated
     by the Catmull-Rom cubic. Other channels come from the nearest pixel. Where nothing is visible, ids are -1 and all
     other values 0.

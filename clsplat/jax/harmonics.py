@@ -28,7 +28,7 @@ def spherical_harmonics(
     coefficients : (..., K, 3) jax.Array
         K is at least (degree + 1)^2.
     masks : (...) jax.Array of bool, optional
-        False makes a result 0.
+        Where it is False, the result is 0.
 
     Returns
     -------
@@ -38,7 +38,7 @@ def spherical_harmonics(
     Raises
     ------
     InputError
-        If a shape is wrong. JAX raises other errors when the program runs, as for `clsplat.jax.rasterize`.
+        If a shape is wrong. For other invalid arguments JAX raises its own error, when the program runs.
 
     Notes
     -----

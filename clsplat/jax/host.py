@@ -12,8 +12,8 @@ import numpy as np
 
 SCHEDULABLE_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 if SCHEDULABLE_CORES == 1:
-    # On one core XLA has one thread. A callback would block this thread, and wait for it to copy the arguments.
-    # XLA reads its number of threads from NPROC when JAX makes its first array.
+    # On one core XLA has a single thread. A callback would run in this thread and wait for the same thread to copy its
+    # arguments: a deadlock. XLA reads its number of threads from NPROC when JAX makes its first array.
     os.environ.setdefault("NPROC", "2")
 
 

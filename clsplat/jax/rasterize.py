@@ -277,7 +277,10 @@ class StaticArguments:
 
 
 class PendingForwards:
-    """Results of forward passes, by the number of the pass. Each is kept until its gradient is computed."""
+    """Results of forward passes, by the number of the pass. Each is kept until its gradient is computed.
+
+    most: largest number of results that are kept.
+    """
 
     def __init__(self, most: int) -> None:
         self._most = most

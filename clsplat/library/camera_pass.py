@@ -120,7 +120,7 @@ class Gradients:
         return self.coefficients[-1].array, add
 
     def by_name(self, *, cameras: bool) -> dict[str, Any]:
-        """Return the gradients on the host, by argument of `rasterize`.
+        """Return the gradients on the host, by the names of the arguments of `rasterize`.
 
         cameras: True includes the gradients with respect to viewmats and intrinsics.
         """
@@ -292,27 +292,27 @@ class CameraPass:
             found["backgrounds"] = zeros if behind is None else behind[: given.channels]
         return found
 
-    def add_gradients(self, gradients: Gradients, by: ViewGradients, *, cameras: bool) -> None:
-        """Add this camera's gradients to `gradients`.
+    def add_gradients(self, gradients: Gradients, projected: ViewGradients, *, cameras: bool) -> None:
+        """Add this camera's gradients with respect to the arguments of `rasterize` to `gradients`.
 
-        by: gradients with respect to the projected Gaussians.
+        projected: gradients with respect to the projected Gaussians.
         cameras: True includes the gradients with respect to the view matrix and the intrinsics.
         """
         session, given, device = self._session, self._given, self._session.device
-        on_image, compensations = by.on_image, self.compensations
-        if by.opacities is not None:
-            gradients.opacities += by.opacities if compensations is None else by.opacities * compensations
+        on_image, compensations, by_opacity = projected.on_image, self.compensations, projected.opacities
+        if by_opacity is not None:
+            gradients.opacities += by_opacity if compensations is None else by_opacity * compensations
             if compensations is not None:
-                on_image = {**on_image, "compensations": by.opacities * given.opacities}
-        if gradients.colors is not None and by.colors is not None:
+                on_image = {**on_image, "compensations": by_opacity * given.opacities}
+        if gradients.colors is not None and projected.colors is not None:
             at = gradients.colors[self._index] if given.by_camera else gradients.colors
-            at += by.colors
+            at += projected.colors
         with session.lock:
             placed = image_gradients(device, on_image)
-            device.under_way.append(placed)  # keeps the host's arrays until the device has read them
+            device.under_way.append(placed)  # keeps the host's arrays alive until the device has read them
             room, add = gradients.room.arrays, gradients.views > 0
             by_camera = self.projected.gradient(placed, room, add=add, by_camera=cameras)
-            by_centre = self._colours_back(gradients, room.means, by.colors, cameras=cameras)
+            by_centre = self._colours_back(gradients, room.means, projected.colors, cameras=cameras)
             gradients.views += 1
             if by_camera is None:
                 return
@@ -323,19 +323,20 @@ class CameraPass:
         gradients.intrinsics.append(intrinsics)
 
     def _colours_back(
-        self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
+        self, gradients: Gradients, d_means: DeviceArray, d_colours: Float32 | None, *, cameras: bool
     ) -> DeviceArray | None:
-        """Add the gradients of SH colours: with respect to coefficients, and through viewing directions to the means.
+        """Propagate the gradient of SH colours to the coefficients and, through viewing directions, to the means.
 
-        d_means: (N, 3), gradient with respect to the means, to which this camera's is added.
-        by_colour: (N, 3), gradient with respect to the colours; None means 0.
-        Returns the gradient with respect to the camera's centre if `cameras` is True.
+        d_means: (N, 3), gradient with respect to the means. This camera's share is added to it.
+        d_colours: (N, 3), gradient with respect to the colours; None means 0.
+        Returns the gradient with respect to the camera's centre if `cameras` is True. Does nothing if colors are not SH
+        coefficients.
         """
         session, count = self._session, self._given.count
         if self._harmonics is None:
             return None
         assert isinstance(self._colours, Hosted), "harmonics are computed on the device"
-        placed = from_host(session.device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
+        placed = from_host(session.device, np.zeros((count, 3), np.float32) if d_colours is None else d_colours)
         session.device.under_way.append(placed)
         d_sh, add = gradients.sh(session.device)
         colours, into = (self._harmonics, self._colours.array, placed), HarmonicsGradients(d_sh, d_means)

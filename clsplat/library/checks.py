@@ -26,9 +26,8 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
     with np.errstate(over="ignore", invalid="ignore"):
         result = np.ascontiguousarray(array, np.float32)
         flat = result.reshape(-1)
-        finite = np.isfinite(flat @ flat) or bool(
-            np.isfinite(flat).all()
-        )  # try a dot product first, which is faster than isfinite; it may overflow
+        # a dot product is faster than isfinite; if it overflows, isfinite decides
+        finite = np.isfinite(flat @ flat) or bool(np.isfinite(flat).all())
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)
@@ -50,8 +49,9 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
-    """Convert the argument `name`, one matrix or several, to float64 (count, side, side).
+    """Convert the argument `name`, (count, side, side) or a single matrix, to float64 (count, side, side).
 
+    count: required number of matrices; a string stands for any number. A single matrix becomes (1, side, side).
     Raises InputError like `floats`.
     """
     floats(name, given, (count, side, side), (side, side))

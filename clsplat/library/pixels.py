@@ -100,7 +100,7 @@ class ListedPixels:
             if depth > SPLAT_VALUES:
                 rows = (listed.projected, gaussians.values, self._background, blended)
                 values(capped, ValuePass(listed.lists, *rows), self._image.array)
-            # keeps the host's arrays until the device has finished
+            # `under_way` keeps the host's arrays alive until the device has finished
             device.under_way.append((gaussians, self._background, self._image, self._alpha))
 
     @property

@@ -38,6 +38,7 @@ class ProjectedView:
     """Gaussians projected to a camera's image. The object keeps memory for its gradient until it is deleted.
 
     gaussians: arrays on the session's device, which must not change before the last `gradient`.
+    compensated: also compute the opacity factors "compensations" for the low-pass filter.
 
     `arrays` has the results on the device. The caller must hold the session's lock.
     """
@@ -76,14 +77,14 @@ class ProjectedView:
         return ewa_grad(session.device, session.scratch, *view, given, gradients, add=add, by_camera=by_camera)
 
 
-def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
+def image_gradients(device: Device, given: Mapping[str, Float32]) -> EwaImageGradients:
     """Upload gradients with respect to projected Gaussians.
 
-    by: gradients by the names "means2d", "depths", "conics" and "compensations"; an absent one counts as 0.
+    given: gradients by the names "means2d", "depths", "conics" and "compensations"; an absent one counts as 0.
     """
 
     def at(name: str) -> DeviceArray | None:
-        return from_host(device, by[name]) if name in by else None
+        return from_host(device, given[name]) if name in given else None
 
     return EwaImageGradients(at("means2d"), at("depths"), at("conics"), at("compensations"))
 
@@ -92,7 +93,7 @@ class HostedGradients(NamedTuple):
     """Gradients with respect to Gaussians.
 
     arrays: the gradients on the device.
-    hosted: the same gradients by the argument's name, to be read on the host.
+    hosted: the same gradients by argument name, to be read on the host.
     """
 
     arrays: EwaGradients
@@ -395,7 +396,7 @@ class GivenShapes:
     def inputs(self, means: DeviceArray, opacities: DeviceArray | None) -> EwaInputs:
         """Return the inputs of the projection, with all arrays on the device that holds `means`.
 
-        means: (n, 3). opacities: (n,), by which bounding boxes are reduced; None for boxes of any opacity.
+        means: (n, 3). opacities: (n,); if given, the bounding boxes of faint Gaussians are smaller.
         """
         quaternions, scales, covariances = (
             None if array is None else from_host(means.device, array)

@@ -28,12 +28,14 @@ class Rasterization:
     """Images of C cameras and the projected Gaussians, on the host, with their vector-Jacobian products.
 
     The first access to an array waits for the device. The object keeps device memory for the vector-Jacobian products
-    until it is deleted. In every array, rows of Gaussians that are not visible are 0.
+    until it is deleted. For a Gaussian that is not visible, the rows of radii, means2d, depths, conics and tile_counts
+    are 0.
 
     Attributes
     ----------
     images : (C, H, W, X) float32
-        Colours over the background, then the depth in world units. A list of (H, W, X) if the cameras' sizes differ.
+        By render_mode, colours over the background, depth in world units, or both with the depth last. A list of
+        (H, W, X) if the cameras' sizes differ.
     alphas : (C, H, W, 1) float32
         0 to 1, or a list like `images`.
     radii : (C, N, 2) int32
@@ -57,7 +59,7 @@ class Rasterization:
 
     @cached_property
     def images(self) -> Float32 | list[Float32]:
-        """Images (C, H, W, X) float32: colours over the background, then the depth in world units.
+        """Images (C, H, W, X) float32: colours over the background, depth in world units, or both with the depth last.
 
         A list of (H, W, X) if the cameras' sizes differ.
         """
@@ -363,8 +365,10 @@ def check_channels(channels: int) -> None:
 
 
 def checked_modes(render_mode: str, rasterize_mode: str, alpha_max: float) -> float:
-    """Check render_mode, rasterize_mode and alpha_max, and return alpha_max. Raises InputError, which names the
-    argument."""
+    """Check render_mode, rasterize_mode and alpha_max, and return alpha_max as a float.
+
+    Raises InputError, which names the argument.
+    """
     choice("render_mode", render_mode, RASTERIZE_RENDER_MODES)
     choice("rasterize_mode", rasterize_mode, RASTERIZE_FILTER_MODES)
     return number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)

@@ -35,7 +35,10 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """Return the array of this name: from this workspace for BACKWARD_ARRAY_NAMES, otherwise from the session's."""
+        """Return the array of this name: from this workspace if BACKWARD_ARRAY_NAMES has it, else from the session's.
+
+        kept: True keeps the contents of the array, as in `Workspace.array`.
+        """
         if name in BACKWARD_ARRAY_NAMES:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)
@@ -95,5 +98,5 @@ def session_of(device: Device | str | None = None) -> LibrarySession:
     if isinstance(device, Device):
         return _session(device)
     # Cached, because listing the devices takes as long as projecting 500,000 Gaussians.
-    # The environment variables are part of the key, because they may change the list.
+    # The environment variables are part of the key, because the selected device and its kernel shape depend on them.
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

@@ -252,7 +252,7 @@ class _GivenLists:
 
     @property
     def images(self) -> tuple[int, ...]:
-        """Sizes of the offsets' axes before the tiles' two. Their product is the number of images."""
+        """Sizes of the axes of `offsets` before the two of the tiles. Their product is the number of images."""
         return self.offsets.shape[:-2]
 
     def of_image(self, image: int, shown: NDArray[np.bool_]) -> _ImageLists:
@@ -328,7 +328,7 @@ def _listed(
 def _shapes_of(values: ArrayLike, last: int) -> list[tuple[int | str, ...]]:
     """Return the shape that an array must have: as many axes as `values`, of any size except the last axis.
 
-    last: required size of the last axis. The result is in a list, as arguments of `checks.floats`.
+    last: required size of the last axis. The result is a list of one shape, for the arguments of `checks.floats`.
     """
     return [(*(f"axis {axis}" for axis in range(max(np.ndim(values) - 1, 1))), last)]
 
@@ -348,7 +348,10 @@ def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, i
         raise InputError(f"flatten_ids: got {ids.min()} to {ids.max()}, expected 0 to {count - 1}, the rows of means2d")
     steps = np.diff(np.concatenate([[0], offsets.reshape(-1).astype(np.int64), [len(ids)]]))
     if (steps < 0).any():
-        raise InputError(f"isect_offsets: expected ascending numbers from 0 to {len(ids)}, the number of pairs")
+        raise InputError(
+            f"isect_offsets: got decreasing numbers or some outside 0 to {len(ids)}, expected ascending numbers from 0 "
+            "to the number of pairs"
+        )
     return offsets.astype(np.int64), ids.astype(np.int64)
 
 

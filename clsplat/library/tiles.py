@@ -158,7 +158,7 @@ def _lengths(**given: int) -> list[int]:
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
     """Return the shape that an array must have: the leading axes of the array `of`, of any size, then the sizes `row`.
 
-    The result is in a list, as arguments of `checks.floats`.
+    The result is a list of one shape, for the arguments of `checks.floats`.
     """
     more = max(np.ndim(of) - len(row), 0)
     return [(*(f"axis {axis}" for axis in range(more)), *row)]
@@ -167,7 +167,7 @@ def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
 def _images(count: tuple[int, ...], image_ids: ArrayLike | None, n_images: int | None) -> tuple[int, NDArray[np.int64]]:
     """Return the number of images, and the image of each Gaussian. Raises InputError.
 
-    count: leading sizes of the arrays: (..., N), or (M,) for packed arrays. There image_ids and n_images are required.
+    count: leading sizes of the arrays: (..., N), or (M,) for packed arrays, which require image_ids and n_images.
     """
     if image_ids is None:
         images = prod(count[:-1])
@@ -177,6 +177,8 @@ def _images(count: tuple[int, ...], image_ids: ArrayLike | None, n_images: int |
         raise InputError(
             f"image_ids: got {given.dtype} of shape {given.shape}, expected integers of shape {count} for packed arrays"
         )
-    if n_images is None or (len(given) and not 0 <= int(given.min()) <= int(given.max()) < n_images):
-        raise InputError(f"image_ids: expected numbers from 0 to below n_images, which is {n_images}")
+    if n_images is None:
+        raise InputError("n_images is None, expected the number of images that image_ids refer to")
+    if len(given) and not 0 <= int(given.min()) <= int(given.max()) < n_images:
+        raise InputError(f"image_ids: got {given.min()} to {given.max()}, expected 0 to below n_images = {n_images}")
     return n_images, given.astype(np.int64)

@@ -111,7 +111,7 @@ _WORKER_RENDERER = _Held()
 
 
 def render_frame(task: Task, job: WorkerJob) -> Result | Failure:
-    """Render a frame in a worker and write its file, unless a worker that was lost since has finished it already.
+    """Render a frame in a worker and write its file, unless another worker wrote the file before that worker was lost.
 
     A frame of a video is not written but returned, to the process that encodes the video.
     """
@@ -142,14 +142,15 @@ def render_on_farm(
 
     on_done: function that is called with the record of each finished frame, as in `workers.run_tasks`.
     scheduler: address of the scheduler of an existing cluster; None starts a cluster on this machine.
-    workers: number of processes of a cluster on this machine.
+    workers: number of processes of a cluster on this machine; None lets Dask choose it.
+    video: the video that the frames belong to; None if each frame has a file.
     Frames of a lost worker are rendered again by others. Raises InputError if no scheduler answers. Raises
     ClsplatError for a frame that cannot be rendered, or whose workers were lost more often than Dask allows.
     """
     if not tasks:
         return
     if not job.options.channels:
-        raise ValueError("no channels")
+        raise ValueError("job.options.channels is empty, expected at least one channel")
     placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
     names = {task.key: str(task.path) for task in tasks}
     with _client(scheduler, workers) as client, _telling_of_no_workers(client, scheduler):

@@ -36,7 +36,7 @@ IDENTITY_ATTRIBUTES = (MODEL_DIGEST_ATTRIBUTE, "clsplat:colorspace")
 def check_folders(tasks: Sequence[Task]) -> None:
     """Raise InputError if frames cannot be written to their folders, or if a frame's file is a folder.
 
-    It creates nothing.
+    Missing folders are not created.
     """
     for folder in sorted({task.path.parent for task in tasks}):
         nearest = next(path for path in (folder, *folder.parents) if path.exists())

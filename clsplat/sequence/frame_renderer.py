@@ -246,13 +246,13 @@ class FrameRenderer:
             )
         self._rays_tested = True
 
-    def _rows(self, camera: Camera, planes: int) -> int:
+    def _rows(self, camera: Camera, holdout_bytes: int) -> int:
         """Return the number of rows of a strip of the camera's picture, or the picture's height if it needs no strips.
 
-        planes: bytes of device memory per pixel that a holdout takes.
+        holdout_bytes: bytes of device memory per pixel that a holdout takes.
         """
         framing = self.options.pictures.framing
-        rows = strip_rows(self._renderer.device, camera, self.options.channels, framing, planes)
+        rows = strip_rows(self._renderer.device, camera, self.options.channels, framing, holdout_bytes)
         # a row of pixels takes a float per pixel and Cryptomatte object
         floats = self._objects * camera.width * framing.supersample**2
         most = DEEP_STRIP_FLOATS // max(floats, 1)
@@ -299,8 +299,11 @@ def open_frame_renderer(
     mattes: Mapping[str, Matte] | None = None,
     tested: bool = True,
 ) -> FrameRenderer:
-    """Open a renderer for the models on the device that `device` names. Raises DeviceError.
+    """Open a device, and create the renderer of a job's frames on it. Raises DeviceError.
 
+    models, mattes: as for `FrameRenderer`.
+    device: name as for --device; None for the default device.
+    memory_limit: limit of device memory in bytes; None for no limit.
     profile: add the times of kernels and transfers on the device to each frame's record.
     tested: False leaves out the self-test of the driver, for a renderer that only plans memory.
     """

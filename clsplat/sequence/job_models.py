@@ -63,7 +63,7 @@ class JobModels:
 
     @property
     def drawn(self) -> Gaussians | tuple[Gaussians | ModelSeries, ...]:
-        """The models in the form that `FrameRenderer` takes."""
+        """The models as `FrameRenderer` takes them: a single model that is not placed, or a tuple of models."""
         return self.one if self.tracks is None else self.models
 
     @property
@@ -133,7 +133,8 @@ class JobModels:
         names, owners = list(self.names), []
         for index, model in enumerate(self.still):
             own = np.full(len(model), index, np.int32)
-            for volume in reversed(self.volumes[index] if self.volumes else ()):  # so that the first wins
+            # reversed: of several volumes that contain a Gaussian, the first is assigned last, and stays
+            for volume in reversed(self.volumes[index] if self.volumes else ()):
                 own[volume.holds(model)] = len(names)
                 names.append(volume.name)
             owners.append(own)
@@ -227,7 +228,7 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
 def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:
     """Load the models at a path: a run folder, a model file, a pattern of files by frame, a shot file or a USD stage.
 
-    transform: transform, over time, of all models; None leaves them in place.
+    transform: a transform over time that is applied to all models; None leaves them in place.
     Raises InputError for an unreadable file, and for models that differ in colour space or rendering method.
     """
     if is_layout(path):

@@ -40,5 +40,5 @@ def open_sequence(pattern: Path) -> tuple[ModelSeries, dict[int, Path]]:
 
 
 def digest_of_name(pattern: Path) -> str:
-    """Return the SHA-256 of the pattern's text. The content of the files is in each frame's `task.settings_digest`."""
+    """Return the SHA-256 of the pattern's text. The content of a frame's files goes into `task.settings_digest`."""
     return hashlib.sha256(str(pattern).encode()).hexdigest()

@@ -35,6 +35,8 @@ def make_views(
     frames: numbers of the frames to render, as in --frames; None for all.
     pattern: pattern of the file names.
     resize: function that returns a camera at the size to render.
+    channels: names of the channels to render.
+    sampling: shutter and lens that the flags set; None for the defaults.
     The tasks of the two eyes alternate. If the pattern has no field for the eye, both eyes are views in one file.
     Raises InputError like `make_tasks` and `Shot.only`.
     """
@@ -73,7 +75,7 @@ def make_tasks(
 ) -> list[Task]:
     """Make the tasks for the frames of `chosen`, which are some or all frames of the shot `whole`.
 
-    pattern, resize: as for `make_views`.
+    pattern, resize, channels, sampling: as for `make_views`.
     Raises InputError if two frames share a file that is not a video, or if a camera does not support the channels or
     depth of field.
     """

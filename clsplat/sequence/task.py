@@ -290,8 +290,8 @@ def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
 
 
 def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Return the camera that is rendered: `picture_camera`, or for a distorted picture the undistorted window that it
-    is sampled from."""
+    """Return the camera that is rendered: `picture_camera`, or the undistorted window that a distorted picture is
+    sampled from."""
     camera, warp = picture_camera(task, pictures), warp_of(task, pictures)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
@@ -410,7 +410,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 def header(task: Task, options: RenderOptions, whole: Task | None = None) -> FrameFileHeader:
     """Make the header of a frame's file: frame, model, version, settings, colour space, and matrices of the camera.
 
-    An EXR file also gets its window, and an attribute that marks a whole panorama.
+    The header of an EXR file also has the picture's window, and an attribute that marks a whole panorama.
 
     task: the frame of one eye. whole: task of the file, if the file has both eyes.
     """

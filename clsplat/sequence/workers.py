@@ -78,7 +78,7 @@ def record_of(
     *,
     skipped: bool = False,
 ) -> Record:
-    """Make the record of a finished frame. seconds: time for rendering and writing."""
+    """Make the record of a finished frame. seconds, skipped: as in `Record`."""
     camera = picture_camera(task, options.pictures)
     return Record(
         task.name,
@@ -113,7 +113,10 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
 
 
 def frames_ahead(tasks: Sequence[Task], options: RenderOptions, devices: int) -> tuple[int, int]:
-    """Return the number of threads that are to write, and the maximum number of frames in main memory at once."""
+    """Return the number of threads that are to write, and the maximum number of frames in main memory at once.
+
+    devices: number of devices that render.
+    """
     largest = max((frame_bytes(task, options) for task in tasks), default=1)
     writers = max(1, min(MAX_FILE_THREADS, os.cpu_count() or 1))
     held = max(devices + 2, min(WRITE_QUEUE_BYTES // max(largest, 1), devices + writers + 1))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks and refusals of arguments (InputError), and conversions between tensors and arrays.
 
-Arguments of `rasterization` such as tile_size and camera_model: `torch/rendering.py`. The names of those that are
-refused stand at the calls of `_refuse_missing` and `_refuse_settings` there.
+`torch/rendering.py` checks the settings of `rasterization`, such as tile_size and camera_model. Its calls of
+`_refuse_missing` and `_refuse_settings` name the arguments of gsplat that clsplat refuses.
 """
 
 from __future__ import annotations
@@ -38,10 +38,15 @@ def renamed(**names: str) -> Iterator[None]:
         yield
     except InputError as error:
         text = str(error)
-        for theirs, ours in names.items():
-            if re.match(rf"{theirs}\b", text):
-                raise InputError(text.replace(theirs, ours, 1)) from None
+        for ours, theirs in names.items():
+            if re.match(rf"{ours}\b", text):
+                raise InputError(text.replace(ours, theirs, 1)) from None
         raise
+
+
+def shape_or_type(value: object) -> str:
+    """Describe an argument for `refuse`: the shape of a tensor, or the type of another value."""
+    return f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
 
 
 def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:

@@ -45,9 +45,14 @@ class Batches:
 class BatchResults:
     """Results of a call of gsplat's function: the library's result for each batch, and the splats in view.
 
-    In the layout of `meta`, arrays are (*batch, C, N, ...). With `packed` they are (nnz, ...), a row for each splat in
-    view.
+    In the layout of `meta`, the third result of `rasterization`, arrays are (*batch, C, N, ...). With `packed` they are
+    (nnz, ...), a row for each splat in view.
     A splat's index is its position in a flattened array (B, C, N): by batch, then camera, then Gaussian.
+
+    batch: sizes of the batch axes. B is their product.
+    sparse: make gradients with respect to SPARSE_GRADIENT_ARGUMENTS COO tensors.
+    absolute: let the backward pass set `means2d.absgrad`.
+    expected_depth: True if the images have expected depth, whose gradient reads the images.
     """
 
     def __init__(
@@ -104,7 +109,7 @@ class BatchResults:
         return stacked([getattr(result, name) for result in self.results])
 
     def by_camera(self, name: str) -> NDArray[Any]:
-        """The array `name` from the results of all batches, with the call's batch sizes: (..., C, ...)."""
+        """The array `name` from the results of all batches, with the call's batch axes: (..., C, ...)."""
         array = self.stacked(name)
         return array.reshape(*self.batch, *array.shape[1:])
 
@@ -184,8 +189,8 @@ class BatchResults:
         """Return the gradient with respect to an array of splats, from all batches, in the layout of `meta`.
 
         each: for each batch, the gradients by name. name: the array's name. like: the array as a tensor.
-        hand_on: keep the array, so that `whole` can return it. It is not kept if `like` has hooks, as a hook could
-        change the tensor without a new version.
+        hand_on: with `packed`, keep the array, so that `whole` can return it. It is not kept if `like` has hooks, as a
+        hook could change the tensor without a new version.
         """
         arrays = [found[name] for found in each]
         array = stacked(arrays)
@@ -214,7 +219,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
         """The splats' means2d, conics, depths and opacities, and their colours (..., C, N, 3) from SH coefficients.
 
-        Without SH coefficients there are no colours.
+        Without SH coefficients the colours are None.
 
         inputs: the tensors that RASTERIZATION_INPUTS names. covars are upper triangles; colors are None unless they are
         SH coefficients.

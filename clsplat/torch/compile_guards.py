@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decorators that keep functions out of the graphs of `torch.compile`. Kernels are launched between the graphs."""
+"""Decorators: one keeps a function out of the graphs of `torch.compile`, the other forbids second derivatives."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def differentiable_once(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Exclude a function from tracing by `torch.compile`.
 
-    `torch.compiler.disable` imports the compiler, which takes seconds. So it is called only after other code has
+    `torch.compiler.disable` imports the compiler, which takes seconds. So it is called only if other code has already
     imported the compiler.
     """
     disabled: list[Callable[_P, _R]] = []

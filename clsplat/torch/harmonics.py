@@ -11,7 +11,7 @@ from torch import Tensor
 from clsplat.device.context import Device
 from clsplat.library.harmonics import HarmonicColors
 from clsplat.library.harmonics import spherical_harmonics as library_harmonics
-from clsplat.torch.arguments import as_array, as_tensor, check_shape, refuse, renamed
+from clsplat.torch.arguments import as_array, as_tensor, check_shape, refuse, renamed, shape_or_type
 from clsplat.torch.compile_guards import differentiable_once, outside_graphs
 
 
@@ -56,7 +56,7 @@ def spherical_harmonics(
     check_shape("dirs", dirs, (*dirs.shape[:-1], 3) if isinstance(dirs, Tensor) and dirs.dim() else ("...", 3))
     check_shape("coeffs", coeffs, (*dirs.shape[:-1], "K", 3))
     if masks is not None and (not isinstance(masks, Tensor) or masks.shape != dirs.shape[:-1]):
-        raise refuse("masks", tuple(getattr(masks, "shape", ())), f"a tensor {tuple(dirs.shape[:-1])}")
+        raise refuse("masks", shape_or_type(masks), f"a tensor {tuple(dirs.shape[:-1])}")
     shown = None if masks is None else masks.detach().cpu().numpy()
     with renamed(directions="dirs", coefficients="coeffs", degree="degrees_to_use"):
         result = library_harmonics(degrees_to_use, as_array(dirs), as_array(coeffs), shown, device=device)

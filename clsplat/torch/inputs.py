@@ -105,7 +105,10 @@ class GivenTensors:
     def rasterized(
         self, settings: RasterizationSettings, batch: tuple[int, ...], *, differentiable: bool
     ) -> list[Rasterization]:
-        """Call `clsplat.rasterize` for each batch, and return the results."""
+        """Call `clsplat.rasterize` for each batch, and return the results.
+
+        batch: sizes of the batch axes. differentiable: as for `clsplat.rasterize`.
+        """
         means, quaternions, scales = Batches(self.means, batch), Batches(self.quats, batch), Batches(self.scales, batch)
         opacities, colors = Batches(self.opacities, batch), Batches(self.colors, batch)
         viewmats, intrinsics = Batches(self.viewmats, batch), Batches(self.Ks, batch)
@@ -141,7 +144,10 @@ class GivenTensors:
 
 
 def _check_colors(colors: Any, batch: tuple[int, ...], cameras: int, count: int, sh_degree: int | None) -> None:
-    """Raise InputError unless `colors` has channels, or, with `sh_degree`, enough SH coefficients for it."""
+    """Raise InputError if `colors` has a wrong shape, no channels, or too few SH coefficients for `sh_degree`.
+
+    count: number of Gaussians in each batch. sh_degree: None if colors are not SH coefficients.
+    """
     if sh_degree is None:
         check_shape("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
         if colors.shape[-1] == 0:

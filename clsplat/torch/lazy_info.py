@@ -21,7 +21,7 @@ class Meta(dict[str, Any]):
         self._makers: dict[str, Callable[[], dict[str, Any]]] = {}
 
     def later(self, names: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> None:
-        """Compute the entries `names` by a call of `make`, on the first access to one of them."""
+        """Add entries `names`, which a call of `make` computes on the first access to one of them."""
         for name in names:
             super().__setitem__(name, None)
             self._makers[name] = make

@@ -11,7 +11,7 @@ from torch import Tensor
 from clsplat.device.context import Device
 from clsplat.library.tile_list_pixels import RasterizedPixels
 from clsplat.library.tile_list_pixels import rasterize_to_pixels as library_pixels
-from clsplat.torch.arguments import as_array, as_tensor, check_shape, check_size, refuse
+from clsplat.torch.arguments import as_array, as_tensor, check_shape, check_size, refuse, shape_or_type
 from clsplat.torch.compile_guards import differentiable_once, outside_graphs
 
 PIXEL_INPUTS = ("means2d", "conics", "colors", "opacities", "backgrounds")
@@ -65,7 +65,7 @@ def rasterize_to_pixels(
     absgrad : bool
         Let the backward pass set `means2d.absgrad` to the sums over pixels of absolute gradients.
     alpha_max : float
-        The cap of alpha.
+        Maximum of a splat's alpha at a pixel.
     device : Device or str, optional
         An open OpenCL device, or a name as `clsplat devices` lists them.
 
@@ -115,7 +115,7 @@ def _check_splats(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Te
     """Raise InputError unless the shapes of the splats' tensors fit together."""
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     if packed and len(leading) != 1:
-        raise refuse("means2d", tuple(means2d.shape), "(nnz, 2), as packed is True")
+        raise refuse("means2d", shape_or_type(means2d), "of shape (nnz, 2), as packed is True")
     check_shape("means2d", means2d, (*leading, 2))
     check_shape("conics", conics, (*leading, 3))
     check_shape("colors", colors, (*leading, "D"))

@@ -96,7 +96,7 @@ def fully_fused_projection(
     conics : (..., C, N, 3) Tensor
         xx, xy, yy of the inverse covariance, 1 / px^2.
     compensations : (..., C, N) Tensor or None
-        0 to 1; None unless asked for.
+        0 to 1; None unless calc_compensations is True.
 
     Raises
     ------

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from clsplat.torch.arguments import check, refuse
+from clsplat.torch.arguments import check, refuse, shape_or_type
 
 
 def compute_relocation(
@@ -25,7 +25,7 @@ def compute_relocation(
     ratios : (N,) Tensor
         Number n of Gaussians that share the place of each Gaussian. Any dtype; clamped to 1 to n_max.
     binoms : (n_max, n_max) Tensor
-        binoms[n, k] is the binomial coefficient n over k.
+        binoms[n, k] is the binomial coefficient n choose k.
     min_opacity : float
         Lower limit of the new opacities, an argument of gsplat 1.6.
 
@@ -51,7 +51,7 @@ def compute_relocation(
     check("scales", scales, (count, 3))
     check("binoms", binoms, ("n_max", binoms.shape[0] if isinstance(binoms, Tensor) and binoms.dim() else "n_max"))
     if not isinstance(ratios, Tensor) or ratios.shape != (count,):
-        raise refuse("ratios", getattr(ratios, "shape", type(ratios).__name__), f"a tensor ({count},)")
+        raise refuse("ratios", shape_or_type(ratios), f"a tensor ({count},)")
     if ratios.is_floating_point():
         check("ratios", ratios, (count,))
     with torch.no_grad():

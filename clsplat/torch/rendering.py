@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's `rasterization`: images of Gaussians, with their gradient. Arguments of gsplat that clsplat does not support
-raise InputError; their names stand at the calls of `_refuse_missing` and `_refuse_settings` in `rasterization`."""
+"""gsplat's `rasterization`: images of Gaussians, with their gradient.
+
+Arguments of gsplat that clsplat does not support raise InputError: those in the calls of `_refuse_missing` and
+`_refuse_settings`.
+"""
 
 from __future__ import annotations
 
@@ -144,7 +147,7 @@ def rasterization(
     channel_chunk, segmented, ut_params
         Ignored; they change no result.
     alpha_max : float
-        The cap of alpha, below 1. gsplat's default is 0.999; `clsplat train` and `render` use 0.99.
+        Maximum of a splat's alpha at a pixel, below 1. The default is gsplat's; `clsplat train` and `render` use 0.99.
     device : Device or str, optional
         An open OpenCL device, or a name as `clsplat devices` lists them. None means the default device
         (docs/drivers.md).
@@ -235,9 +238,8 @@ def rasterization(
         results = given.rasterized(settings, batch, differentiable=differentiable)
     expected = render_mode.endswith("ED")
     call = BatchResults(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if (
-        not differentiable and not given.have_tangents
-    ):  # `_with_gradient` passes dual tensors to PyTorch, which refuses them
+    # dual tensors go on to `_with_gradient`, where PyTorch raises its error for forward-mode differentiation
+    if not differentiable and not given.have_tangents:
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     splats, images, alphas = _with_gradient(call, given, settings.sh_degree, depth_alone=depth_alone)
     return images, alphas, _meta(call, means, splats, width, height, tile_size)
@@ -246,7 +248,10 @@ def rasterization(
 def _with_gradient(
     call: BatchResults, given: GivenTensors, sh_degree: int | None, *, depth_alone: bool
 ) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The splats' means2d, conics, depths and opacities, the images and the alphas, as differentiable tensors."""
+    """The splats' means2d, conics, depths and opacities, the images and the alphas, as differentiable tensors.
+
+    sh_degree: None if colors are not SH coefficients. depth_alone: True if no colour is rendered.
+    """
     covars, colors = given.covars, given.colors
     if covars is not None:
         covars = (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clsplat.library import tiles
-from clsplat.torch.arguments import as_array, check_shape, refuse
+from clsplat.torch.arguments import as_array, check_shape, refuse, shape_or_type
 from clsplat.torch.compile_guards import outside_graphs
 
 
@@ -106,12 +106,12 @@ def _check_splats(means2d: Tensor, radii: Tensor, depths: Tensor) -> None:
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     check_shape("means2d", means2d, (*leading, 2))
     if not isinstance(radii, Tensor) or radii.shape != means2d.shape:
-        raise refuse("radii", tuple(getattr(radii, "shape", ())), f"a tensor {tuple(means2d.shape)}")
+        raise refuse("radii", shape_or_type(radii), f"a tensor {tuple(means2d.shape)}")
     check_shape("depths", depths, leading)
 
 
 def _checked_ids(n_images: int | None, image_ids: Tensor | None, gaussian_ids: Tensor | None) -> NDArray[Any]:
-    """The image of each packed splat. Raises InputError if an argument is missing."""
+    """The image of each packed splat, from `image_ids`. Raises InputError if an argument is None."""
     for name, value in (("n_images", n_images), ("image_ids", image_ids), ("gaussian_ids", gaussian_ids)):
         if value is None:
             raise refuse(name, None, "a value, as packed is True")

@@ -151,7 +151,7 @@ def test_harmonics(degree: int) -> None:
         assert (one.grad - wanted).norm() <= 1e-5 * wanted.norm()
     if degree:
         refuses("coeffs", spherical_harmonics, degree, directions, coefficients[..., :1, :])
-    refuses(r"masks is \(9,\)", spherical_harmonics, degree, directions, coefficients, masks[0])
+    refuses(r"masks is of shape \(9,\)", spherical_harmonics, degree, directions, coefficients, masks[0])
 
 
 def test_harmonics_name_their_arguments() -> None:

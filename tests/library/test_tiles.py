@@ -162,7 +162,7 @@ def test_packed_arrays_and_masks(default_device: Device) -> None:
         ({"colors": np.zeros((2, 9, 0))}, "colors has 0 channels, expected 1 or more"),
         ({"opacities": np.full((2, 9), np.nan)}, "opacities"),
         ({"isect_offsets": np.zeros((2, 3, 4), np.int32)}, "isect_offsets: got int32 of shape"),
-        ({"isect_offsets": np.full((2, 3, 3), 7, np.int32)}, "isect_offsets: expected ascending numbers"),
+        ({"isect_offsets": np.full((2, 3, 3), 7, np.int32)}, "isect_offsets: got decreasing numbers"),
         ({"flatten_ids": np.array([18])}, "flatten_ids: got 18 to 18, expected 0 to 17"),
         ({"flatten_ids": np.array([0.5])}, "flatten_ids: got float64"),
         ({"masks": np.ones((2, 3, 3))}, "masks: got float64"),

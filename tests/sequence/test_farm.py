@@ -229,7 +229,7 @@ def test_what_a_worker_does(shot: list[str], tmp_path: Path) -> None:
         assert isinstance(found, farm.Failure)
         assert found.wrong_input
         assert message in found.message
-    with pytest.raises(ValueError, match="no channels"):
+    with pytest.raises(ValueError, match="channels is empty"):
         farm.render_on_farm([task], replace(job, options=RenderOptions(())), print, workers=1)
 
 

@@ -60,7 +60,10 @@ def what_is_absent(name: str) -> str:
 
 
 def refuses(name: str, theirs: Callable[..., Any] | None = None) -> Callable[..., NoReturn]:
-    """Create a replacement for gsplat's function `name` that raises InputError when it is called."""
+    """Create a replacement for gsplat's function `name` that raises InputError when it is called.
+
+    theirs: gsplat's function, whose docstring the replacement gets; None if gsplat is not installed.
+    """
 
     def call(*_: Any, **__: Any) -> NoReturn:
         raise InputError(what_is_absent(name))

@@ -115,10 +115,10 @@ def strategy(name: str) -> Any:
 
 
 def _of_gsplat(place: str, name: str) -> Any:
-    """Return the attribute `name`, which clsplat lacks, of the module `place` that replaces a module of gsplat.
+    """Return the attribute `name` of `place`, a module that `_make_package` created without this attribute.
 
     For a function that needs CUDA, the result is a function that raises InputError; for a strategy, gsplat's class.
-    Raises ImportError if gsplat is needed and not installed, and AttributeError for other names.
+    Raises ImportError if the name needs gsplat, which is not installed, and AttributeError for other names.
     """
     if name in absent_names.CUDA_ONLY_NAMES:
         return absent_names.refuses(name)
