@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +53,8 @@ def bench(
 
     The device's queue should have been created with profiling, as kernels' times come from its events.
 
-    config: settings of the rasterizer; None for the defaults.
     repeat: number of rounds in which the frame and the step are measured. Times are medians.
     limits: the device's measured limits; None measures them.
-    progress: function that is called with a text and the completed fraction; None for no calls.
     """
     say = progress or no_progress
     config = (config or RasterizerConfig()).switches()
@@ -66,10 +65,7 @@ def bench(
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
     if held_kind(config) != held_kind(RasterizerConfig()):  # SH is stored in another form: upload a second model
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
-
-    def draw() -> ForwardPass:
-        return rasterizer.forward(gaussians, subject.camera, trainer.background, backward=False)
-
+    draw = partial(rasterizer.forward, gaussians, subject.camera, trainer.background, backward=False)
     frame = draw()
     visible = int(np.count_nonzero(frame.projected.tile_counts.get()))
     pairs = _pairs_of(rasterizer, frame)

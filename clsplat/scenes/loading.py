@@ -63,8 +63,7 @@ def load_scene(
     path: a folder in a layout that `detect` knows, or a transforms.json.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
-    test_most: maximum number of held-out views. If `test_every` gives more, an even selection of them is held out. 0
-        for no maximum.
+    test_most: maximum number of held-out views. Of more, an even selection is held out. 0 for no maximum.
     images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
         images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
         Such a folder of any size is used if there are no other pictures.
