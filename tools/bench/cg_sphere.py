@@ -60,7 +60,7 @@ def cast(
 ) -> tuple[NDArray[Any], list[list[list[float]]], NDArray[Any]]:
     """Beauty (H, W, 4), deep samples and nearest depths (H, W) of a sphere.
 
-    A pixel in which a ray hits the sphere has one deep sample [alpha, mean depth]; others have none, and infinite depth.
+    A pixel in which a ray hits the sphere has one deep sample [alpha, mean depth]; others have none and infinite depth.
     """
     middle = camera.rotation @ centre + camera.translation
     fine = camera.resized(camera.width * FINE, camera.height * FINE)
