@@ -9,8 +9,8 @@ The scene is the synthetic one of `clsplat bench`. First the number of Gaussians
 Gaussians shrink so that their total area stays the same. Then the image grows at 4:3, and 200,000 Gaussians grow with
 it. Times are medians of the wall time of `Rasterizer.forward`, from an idle device to an idle device.
 
-The line ms = a + b x is fitted by least squares of the relative residuals (each weighted by 1 / ms), so that small
-sizes count as much as large ones. The largest residual is printed as a fraction of the measured time.
+The line ms = a + b x is fitted by least squares of the relative residuals (each weighted by 1 / ms). So small sizes
+count as much as large ones. The largest residual is printed as a fraction of the measured time.
 """
 
 from __future__ import annotations

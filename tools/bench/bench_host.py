@@ -9,7 +9,7 @@ affect the host's work, unless lists are so long that they are sorted by radix. 
 an idle device, whose queue waits for a user event until the launch has returned. So meanwhile no kernel uses the same
 cores, and no call waits for a kernel. The thread's CPU time is measured. Caches are cold, as after a wait.
 
-The time is divided among CAUSES. The time of a cause excludes the time of other causes that its functions call. The
+The time is divided among CAUSES. The time of a cause excludes the time of other causes that run inside it. The
 measurement itself adds half a microsecond to each call. Prints medians, and the least time of all steps, which other
 load on the machine affects least.
 """
@@ -64,7 +64,7 @@ REST = "all else"
 
 
 class Stopwatch:
-    """Measures this thread's microseconds for each cause, without those of other causes that its functions call."""
+    """Measures this thread's microseconds for each cause, without the time of other causes that run inside it."""
 
     def __init__(self) -> None:
         self.taken: dict[str, float] = {}

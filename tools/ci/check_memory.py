@@ -8,8 +8,8 @@ Runs `memory_workload.py` in child processes whose only device is Oclgrind's (De
 once for bounds, races and API calls, and once for uninitialised values. Prints each finding with its kernel and line.
 With --short, as in CI, pictures are of one tile or two, training's methods take one step, and the parts of WHOLE_ONLY
 are left out. Every kernel still runs in every build (`-D` options) that it has without --short. The exit status is 0
-if nothing was found, and 2 without Oclgrind. It is 1 if there are findings, if a kernel never ran, if a part that
---short leaves out has a build of its own, or if a planted fault was missed.
+if nothing was found, and 2 without Oclgrind. It is 1 if there are findings, or if a planted fault was missed. It is 1
+also if a kernel never ran, or if a part that --short leaves out has a build of its own.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class Result:
 def run(shape: str, check: str, part: str, driver: Path, folder: Path, *, short: bool = False) -> Result:
     """Run a part of the workload in a child process whose only device is Oclgrind's.
 
-    check: a key of CHECKS. driver: Oclgrind's. folder: gets the log. short: with --short.
+    check: a key of CHECKS. driver: Oclgrind's. folder: gets the log. short: True for the short form of --short.
     """
     vendors = folder / "vendors"
     vendors.mkdir(exist_ok=True)

@@ -7,13 +7,14 @@
 
 All machines share this Python environment. They differ in drivers, environment variables, user, and the place of the
 home folder, which is new, so that every driver is used for the first time. --list prints the machines' names, --only
-selects some, --full runs all of tools/test on some, --short leaves out machines whose drivers the machine `all` has
-and runs the smoke tests on few, --jobs sets how many run at once, and --markdown prints the table for docs/machines.md.
+selects some, and --full runs all of tools/test on some. --short leaves out machines whose drivers the machine `all`
+has, and runs the smoke tests on few. --jobs sets how many run at once, and --markdown prints the table for
+docs/machines.md.
 
-PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL through CLSPLAT_DEBIAN_POCL (its
-libpocl.so) or in the system's list, Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so), and Debian's QEMU
-through CLSPLAT_QEMU (its program) or on the path. A machine whose parts are missing is "not run", with the reason. The
-exit status is 1 if one failed. docs/machines.md has the purpose of each.
+PyPI's PoCL and Intel's runtime are found in this environment. Debian's PoCL is found through CLSPLAT_DEBIAN_POCL (its
+libpocl.so) or in the system's list, and Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so). Debian's QEMU is
+found through CLSPLAT_QEMU (its program) or on the path. A machine whose parts are missing is "not run", with the
+reason. The exit status is 1 if one failed. docs/machines.md has the purpose of each.
 """
 
 from __future__ import annotations

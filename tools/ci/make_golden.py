@@ -73,8 +73,8 @@ ORDERED = ("/loss", "/masks", "/blend_grad", "/values")
 
 
 def write_selftest(path: Path) -> None:
-    """Run the self-test in every shape, and write the digests: one of each result, or for results of the stages in
-    ORDERED one for each shape."""
+    """Run the self-test in every shape, and write the digests: one per result, but one per result and shape for the
+    stages in ORDERED."""
     device = open_device()
     by_shape: dict[str, dict[str, str]] = {}
     for label in SHAPES:

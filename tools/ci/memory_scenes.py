@@ -31,7 +31,7 @@ class Extent:
     missed: int = 300
 
     def shorten(self) -> None:
-        """Make everything as small as it may be if every kernel is still to have all its builds."""
+        """Make everything as small as possible while every kernel still has all its builds."""
         self.frame = self.view = 9, 17
         self.low = self.picture = 9, 7
         self.capacity, self.steps, self.missed = 40, 1, 40

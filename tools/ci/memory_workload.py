@@ -147,7 +147,7 @@ def long_lists(device: Device) -> None:
     stages_blend.PART_PAIRS = part = max(own.shape.items, 64)
     view = camera(9, 7)
     gaussians = cloud(4 * part, view, 2, degree=0)
-    gaussians.opacity_logits[:] = np.linspace(-5, -2, len(gaussians), dtype=np.float32)  # keeps pixels transparent
+    gaussians.opacity_logits[:] = np.linspace(-5, -2, len(gaussians), dtype=np.float32)  # no pixel becomes opaque
     rasterizer, held = Rasterizer(own), upload_gaussians(own, gaussians)
     frame = rasterizer.forward(held, view, np.zeros(3, np.float32), nearness=True)
     planes = np.random.default_rng(1).normal(size=(5, *frame.blended.stops.shape)).astype(np.float32)
@@ -250,7 +250,7 @@ def methods(device: Device) -> None:
     _train(device, replace(short, antialiased=True), 3, low)
     _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, low)
     _train(device, replace(short, appearance="exposure", masks="ignore"), 5, low)
-    # So small a scene gives no pull of gains, so that one is made here. Row 2 is the last one of the arrays.
+    # A scene this small gives no matrix that pulls gains; here is one. Row 2 is the last row of the arrays.
     gains = Gains.on(device, np.zeros((3, 3), np.float32), csr_array(np.ones((3, 3))))
     columns, readback = upload(device, np.ones((3, 16), np.float32)), upload(device, np.zeros(len(READBACK), np.uint32))
     step_gains(device, gains, 2, columns, 1, 1e-3, readback)

@@ -97,8 +97,9 @@ def _latency(name: str) -> int | None:
 
 
 def _issued(each: Instruction, now: int, ready: list[int], access: int, conflicts: int) -> int:
-    """The cycle in which the next instruction may begin, if this one is the next at the cycle `now`.
+    """The cycle in which the next instruction may begin.
 
+    now: the cycle in which this instruction may begin.
     ready: cycles in which the scoreboards are clear; changed in place.
     access: cycles of an access to global memory.
     conflicts: cycles by which conflicts of banks delay the instruction's result.

@@ -111,7 +111,7 @@ def parts_of(stages: Mapping[str, Stage]) -> dict[str, Stage]:
 
 
 def stage_table(predictions: Predictions, frame: str) -> str:
-    """Table of the milliseconds of each part of a step: on GPU, and on VKSPLAT_GPU beside VkSplat's."""
+    """Table of the milliseconds of each part of a step: on `GPU`, and on `VKSPLAT_GPU` beside VkSplat's."""
     now, other = (list(parts_of(predictions[SHAPE, gpu, frame]).items()) for gpu in (GPU, VKSPLAT_GPU))
     lines = [["part", "launches", "issue, ms", "memory, ms", "chains, ms", "predicted, ms"]]
     lines[0] += [f"{VKSPLAT_GPU}: predicted, ms", "VkSplat there, ms"]
@@ -236,7 +236,7 @@ def now_table(measured: Sequence[Measured], constants: Constants) -> str:
 def wanted_table(measured: Sequence[Measured], constants: Constants, now: Works) -> str:
     """Table of the steps of WANTED_STEPS, predicted for the code that was measured and for the present kernels.
 
-    It also has the model's errors against the measurement: that of the step, and the mean one of its parts.
+    It also has the model's error against the measurement, in the step and on average in its parts.
     """
     lines = [["step", "then, ms", "now, ms", "wanted, ms", "met", "error of fit: step, parts"]]
     for name, frame, most in WANTED_STEPS:

@@ -57,10 +57,11 @@ def launches_in(folder: Path, commit: str, shape: str, frames: Sequence[Mapping[
 
 
 def recount(rows: Sequence[dict[str, Any]], frames: Sequence[Mapping[str, Any]], count: Count) -> None:
-    """Set `inputs` of all scenes of calibration.json that have a frame, to those of the code that was measured.
+    """Set the `inputs` of all scenes that have a frame to those of the code that was measured.
 
     A row's code is that of `commit`, or of `counted` if the tools of its own commit record no launches. A scene's
-    `counts` replace those of its frame, where the measured kernels divided tiles differently. rows: changed in place.
+    `counts` replace those of its frame, where the measured kernels divided tiles differently.
+    rows: of calibration.json; changed in place.
     """
     by_name = {frame["name"]: frame for frame in frames}
     for row in rows:

@@ -39,7 +39,7 @@ class Rule:
     the heads of two loops.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
     inner: True if rounds are per round of the enclosing loop.
-    copies: True if a compiler makes copies of the loop, of which each runs so often and none is a remainder loop.
+    copies: True if a compiler makes copies of the loop that run so often each, with no remainder loop among them.
     near: True if the loop reads what the group's items have just read.
     active: mean number of a wave's items that take part in a round, or that access different addresses; all if None.
     """

@@ -16,9 +16,9 @@ Instructions per (tile, Gaussian) pair are those of all waves of a group, from r
 prints a table from Intel's compiler, which reports less (`gpu_intel.py`). --page writes docs/gpu-static.md, with the
 times that `gpu_model.py` predicts, and fits the model's constants to docs/gpus/calibration.json on the way. --check
 tests the ceilings below, the page's goals, and the predictions against what was measured, and compares the page with
-current kernels. The exit status is 0 if all is as expected, 2 if a compiler is missing, and 1 if a ceiling is exceeded,
-a goal is missed, a prediction is too far off, the page is out of date, a loop has no rule, a rule has no loop, or a
-compiler refuses a kernel.
+current kernels. The exit status is 0 if all is as expected, and 2 if a compiler is missing. It is 1 if a ceiling is
+exceeded, a goal is missed, a prediction is too far off or the page is out of date. It is 1 also if a loop has no rule,
+a rule has no loop, or a compiler refuses a kernel.
 --inputs counts the inputs in docs/gpus/calibration.json anew, in the code that was measured, from the repository's
 history.
 `gpu_devices.py` computes the occupancy.

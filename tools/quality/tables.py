@@ -78,7 +78,7 @@ photographs, the dependence on direction is learnt wrongly, and the more so the 
 
 
 def growth_rows() -> list[Row]:
-    """Rows with the paper's growth, and rows of other growths with half as many Gaussians as the best of the former."""
+    """Rows with the paper's growth, and others with half as many Gaussians as the better of default and short."""
     rows = []
     for scene in SCENES:
         rows += [Row(f"{scene} {name}", scene, settings) for name, settings in WHOLES.items()]

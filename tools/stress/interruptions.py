@@ -224,7 +224,7 @@ def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, n
     """Outcome of a process that has ended.
 
     done: its exit status and its output.
-    names: paths that the outcome has by these names.
+    names: paths by name; in the outcome, the name replaces the path.
     """
     status, text = done
     lines = [line for line in text.splitlines() if line.strip()]

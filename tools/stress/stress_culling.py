@@ -47,7 +47,7 @@ STEPS = ((0, 0), (1, 0), (1, 1), (1, 5000), (10, 0), (10, 30), (100, 1000), (300
 
 @dataclass
 class Tally:
-    """Numbers of pairs: all, those in which a Gaussian has a tile, and those found visible. missed: of Gaussians."""
+    """Numbers of pairs: all, with a tile (`reached`), and found visible. missed: number of Gaussians missed."""
 
     pairs: int = 0
     reached: int = 0

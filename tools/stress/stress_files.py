@@ -115,7 +115,7 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seco
 
     tasks: receives (reader, first, stop). Sends ("case", number) and ("done", seconds, MiB, refused, trouble) for each
     case, then ("end",).
-    memory, most_seconds: MiB and CPU seconds of a case from which it fails.
+    memory, most_seconds: maximum MiB and CPU seconds of a case; with more it fails.
     """
     import signal
 
@@ -217,7 +217,7 @@ def stress(
     """Run `cases` cases, divided among the readers by their weights. Returns the tally of each reader.
 
     first: number of each reader's first case.
-    memory, seconds: MiB and CPU seconds of a case from which it fails.
+    memory, seconds: maximum MiB and CPU seconds of a case; with more it fails.
     """
     weights = {name: READERS[name].weight for name in names}
     share = {name: max(round(cases * weight / sum(weights.values())), 1) for name, weight in weights.items()}

@@ -5,10 +5,10 @@
         [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE] [--json] [--control SHARE]
 
 The model is a plain of cells, each with a chunk of Gaussians that are made from a seed. Each camera looks at a small
-part of the plain. Prints the time of a step, the bytes that a step moves, the peak of anonymous and shared memory, and
-a digest of parameters and moments after the last step, which is the same at every limit. With --control, density
-control follows: in a share of the chunks it clones some Gaussians and removes others. Then its time, its peak, and the
-bytes that this process reads and writes for it (Linux) are printed too.
+part of the plain. Prints the time of a step, the bytes that a step moves, and the peak of anonymous and shared memory.
+Also prints a digest of parameters and moments after the last step, which is the same at every limit. With --control,
+density control follows: in a share of the chunks it clones some Gaussians and removes others. Then its time, its peak,
+and the bytes that this process reads and writes for it (Linux) are printed too.
 """
 
 from __future__ import annotations
