@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the checkout's own environment, `.venv`, with clsplat installed in it; `tools/demo` and `tools/test` use it.
+"""Make the checkout's own environment, `.venv`, with clsplat installed in it; `tools/demo` and `tools/test` use it.
 
 It needs only Python's standard library and a package index that pip can reach. Run as a script, it installs the extras
 named as arguments and prints the path of the environment's Python.

@@ -285,7 +285,7 @@ def test_a_line_of_one_function() -> None:
 def test_rules_that_no_loop_has_are_told() -> None:
     used = {"scan_chunks": (*BY_ITEM["scan_chunks"][:1], *EVERYWHERE)}
     (told,) = unused_rules(used)
-    assert told.startswith("scan_chunks: no loop of it is that of the rule `for (uint base = begin;")
+    assert told.startswith("scan_chunks: has no loop for the rule `for (uint base = begin;")
     used = {"scan_chunks": (*BY_ITEM["scan_chunks"], *EVERYWHERE), "ranges": ()}
     assert unused_rules(used) == []  # of a rule for every kernel, one has the loop
     used["scan_chunks"] = BY_ITEM["scan_chunks"]
@@ -383,7 +383,7 @@ def test_ceilings() -> None:
     assert broken([*good, row("sort_radix", stack=8, target="gfx1100")]) == []
     assert len(broken([*good, row("blend", spills=4, target="gfx1100")])) == 1
     assert broken([*good, row("blend", unknown="a loop")]) == ["a loop"]
-    assert "sort_radix: no kernel file of a step" in broken(good[:-1])[0]
+    assert "sort_radix: in NO_STACK of gpu_static.py, expected a kernel file of a step" in broken(good[:-1])[0]
 
 
 def adams_loop(loads: int, size: int, name: str = "LDG.E.128", scattered: int = 0) -> Loop:
@@ -404,7 +404,7 @@ def adams_loop(loads: int, size: int, name: str = "LDG.E.128", scattered: int = 
         (adams_loop(3, 201), {}, "50.25 instructions of Adam per element, expected at most 50"),
         (adams_loop(2, 200), {}, "2 loads of 16 bytes before Adam's arithmetic, expected 3"),
         (adams_loop(3, 200, "LDG.E"), {}, "0 loads of 16 bytes before Adam's arithmetic, expected 3"),
-        (adams_loop(3, 200, scattered=45), {}, "45 loads of SH coefficients a row an item, expected none"),
+        (adams_loop(3, 200, scattered=45), {}, "45 loads of SH coefficients, each item from its row, expected none"),
         (adams_loop(3, 200), {"registers": 97}, "97 registers, expected at most 96"),
         (adams_loop(3, 3382), {"target": "gfx1100"}, "3383 instructions, expected at most 3382"),
     ],

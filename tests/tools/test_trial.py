@@ -321,7 +321,7 @@ def test_counters_of_ncu() -> None:
 @pytest.mark.slow
 def test_launches_for_their_twins(device: VariedDevice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each kernel's arguments in order, as they are before its first launch of a step by capacity. These launches have
-    the order of tiles, which the twins expect: ncu would crash without it."""
+    the order of tiles, which the CUDA copies expect: ncu would crash without it."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     trial_counters.dump(fox_like(200, 48, 32), device, trial_counters.TWINS, tmp_path)
     assert {path.stem for path in tmp_path.iterdir()} == set(trial_counters.TWINS)

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a frame against the number of Gaussians and against the size of the image, and how far off a line it is.
+"""Measure how the time of a frame grows with the number of Gaussians and with the image's size, and fit a line to each.
 
     python tools/bench/bench_growth.py [--max-gaussians 3e6] [--max-megapixels 8] [--repeat 5] [--device DEVICE]
                                        [--json] [--plot growth.svg]
 
-The scene is the synthetic one of `clsplat bench`. The number of Gaussians grows at 1024x768, and they shrink so that
-their total area stays the same. The number of pixels grows with 200,000 Gaussians, which grow with the image, 4:3.
-Times are medians of the wall time of `Rasterizer.forward`, from an idle device to an idle device.
+The scene is the synthetic one of `clsplat bench`. First the number of Gaussians grows, in images of 1024x768. The
+Gaussians shrink so that their total area stays the same. Then the image grows at 4:3, and 200,000 Gaussians grow with
+it. Times are medians of the wall time of `Rasterizer.forward`, from an idle device to an idle device.
 
-The line ms = a + b x is fitted by least squares of the relative residuals (each weighted by 1 / ms), so that small
-sizes count as much as large ones. The largest residual is printed as a fraction of the measured time.
+The line ms = a + b x is fitted by least squares of the relative residuals (each weighted by 1 / ms). So small sizes
+count as much as large ones. The largest residual is printed as a fraction of the measured time.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def growth(rows: list[Result], unit: str, x: Sequence[float]) -> Result:
 
 
 def table(part: Result) -> list[str]:
-    """Text table of the times over Gaussians, or over pixels."""
+    """Text table of a result of `growth`: times over Gaussians, or over pixels."""
     rows: list[tuple[str, ...]] = [("Gaussians", "image", "tile pairs", "ms", "off the line")]
     for row in part["rows"]:
         size, off = f"{row['width']}x{row['height']}", f"{row['residual']:+.1%}"
@@ -88,7 +88,7 @@ def table(part: Result) -> list[str]:
 
 
 def panel(part: Result) -> Panel:
-    """Panel of the plot for Gaussians, or for pixels."""
+    """Panel of the plot for a result of `growth`: times over Gaussians, or over pixels."""
     measured = [(row["x"], row["ms"]) for row in part["rows"]]
     ends = np.geomspace(measured[0][0], measured[-1][0], 50).tolist()  # the line is curved on logarithmic axes
     fitted = [(x, part["ms_at_zero"] + part["ms_per_unit"] * x) for x in ends]

@@ -7,8 +7,8 @@
 Kernels without checks are built with UNGUARDED, which exists only for this comparison: `adam` stores every result, and
 `project` draws any colour. Both trainers have the same model and picture, and learning rates of zero, so that every
 step is the same work. Without a subject, the scene is the synthetic one of `clsplat bench`. Each round runs a step of
-each trainer in alternating order. Printed are medians of wall time and of the process's CPU time, and the median of the
-ratios of each round's two steps, which is the least sensitive to other load on the machine.
+each trainer, in alternating order. Prints medians of wall time and of the process's CPU time. It also prints the median
+over all rounds of the ratio of the two steps' times, which other load on the machine affects least.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def step_seconds(trainer: Trainer) -> tuple[float, float]:
 
 
 def measure(device: Device, path: Path | None, repeat: int) -> Result:
-    """Measure the times and ratios that the module describes, in milliseconds."""
+    """Measure the times (ms) and ratios that the module describes. path: None for the synthetic scene."""
     subject = load_subject(path) if path is not None else synthetic()
     trainers = [
         trainer_of(subject, each, RasterizerConfig()) for each in (device, device.with_switches({"UNGUARDED": True}))

@@ -9,9 +9,9 @@ affect the host's work, unless lists are so long that they are sorted by radix. 
 an idle device, whose queue waits for a user event until the launch has returned. So meanwhile no kernel uses the same
 cores, and no call waits for a kernel. The thread's CPU time is measured. Caches are cold, as after a wait.
 
-The time is divided among CAUSES. The time of a cause excludes that of the causes that it calls. The measurement itself
-adds half a microsecond to each call. Medians are printed, and the least time of all steps, which other load on the
-machine affects least.
+The time is divided among CAUSES. The time of a cause excludes the time of other causes that run inside it. The
+measurement itself adds half a microsecond to each call. Prints medians, and the least time of all steps, which other
+load on the machine affects least.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ REST = "all else"
 
 
 class Stopwatch:
-    """Measures the microseconds of this thread for each cause, without those of the causes that it calls."""
+    """Measures this thread's microseconds for each cause, without the time of other causes that run inside it."""
 
     def __init__(self) -> None:
         self.taken: dict[str, float] = {}
         self._inner: list[int] = [0]
 
     def around(self, cause: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, with its time added to a cause."""
+        """A function that calls `function`, and adds the time of the call to a cause."""
 
         def timed(*arguments: Any, **options: Any) -> Any:
             start = time.thread_time_ns()
@@ -87,7 +87,7 @@ class Stopwatch:
 
     @contextmanager
     def on(self) -> Iterator[None]:
-        """Inside the block, the functions of CAUSES are timed."""
+        """A context manager, inside which the functions of CAUSES are timed."""
         with ExitStack() as patches:
             for cause, places in CAUSES.items():
                 for owner, name in places:
@@ -96,7 +96,7 @@ class Stopwatch:
 
 
 def held(device: Device, work: Callable[[], object]) -> float:
-    """Microseconds of this thread in `work`. The commands that it queues begin only afterwards."""
+    """Microseconds of this thread in `work`. The commands that `work` queues begin only after its return."""
     device.finish()
     gate = cl.UserEvent(device.context)
     cl.enqueue_barrier(device.queue, wait_for=[gate])
@@ -110,7 +110,10 @@ def held(device: Device, work: Callable[[], object]) -> float:
 
 
 def measure(trainer: Trainer, steps: int, repeat: int) -> Result:
-    """Measure steps after `steps` steps: their calls, their time, and in separate steps the time of each cause."""
+    """Train for `steps` steps, then measure `repeat` steps, and as many others with the time of each cause.
+
+    Calls on the queue are counted in further steps.
+    """
     device = trainer.device
     for _ in range(steps):
         trainer.train_step()

@@ -6,7 +6,7 @@
 
 The ways are: pyopencl, which makes an event for each launch; ctypes, without events; and, if the driver has
 cl_khr_command_buffer, a command buffer of the driver, which may be on the queue several times at once. If the driver
-aborts in it, this process ends. As in bench_host.py, the queue waits for a user event meanwhile, and the thread's CPU
+aborts, this process ends too. As in bench_host.py, the queue waits for a user event meanwhile, and the thread's CPU
 time is measured.
 """
 
@@ -45,7 +45,7 @@ Launch = Callable[[], object]
 def checked(status: int, call: str) -> None:
     """Raise pyopencl's RuntimeError if an OpenCL call has returned an error status."""
     if status:
-        raise cl.RuntimeError(f"{call}: status {status}")
+        raise cl.RuntimeError(f"{call}: returned status {status}, expected 0")
 
 
 class Driver:
@@ -58,7 +58,7 @@ class Driver:
         self.launch.argtypes = [POINTER, POINTER, COUNT, *[POINTER] * 3, COUNT, POINTER, POINTER]
 
     def extension(self, name: str, *types: Any) -> Callable[..., Any]:
-        """The function of an extension. types: the types of its result and arguments."""
+        """A function of an OpenCL extension, by its name. types: its result's type, then its arguments' types."""
         find = self._library.clGetExtensionFunctionAddressForPlatform
         find.restype, find.argtypes = POINTER, [POINTER, ctypes.c_char_p]
         address = find(self._platform, name.encode())
@@ -88,7 +88,7 @@ class Driver:
 
 
 def ways(device: Device, kernels: Sequence[cl.Kernel]) -> dict[str, Launch]:
-    """Functions that launch all kernels, by the name of their way."""
+    """Functions that launch all kernels, keyed by the name of the way of launching."""
     driver, queue, size = Driver(device), device.queue, (ctypes.c_size_t * 1)(ITEMS)
     with_event = [partial(cl.enqueue_nd_range_kernel, queue, kernel, (ITEMS,), (ITEMS,)) for kernel in kernels]
     handles = [(POINTER(queue.int_ptr), POINTER(kernel.int_ptr)) for kernel in kernels]

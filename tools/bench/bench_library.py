@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Time of the library's calls beside the renderer's and the trainer's.
+"""Compare the times of the library's calls with those of the renderer and the trainer.
 
     python tools/bench/bench_library.py [--gaussians 1e5] [--size 640x480] [--repeat 25] [--device DEVICE] [--json]
 
@@ -57,7 +57,7 @@ def arrays_of(subject: Subject) -> dict[str, Any]:
 
 
 def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
-    """`Renderer.render`, a trainer's frame, and its gradient from an image gradient on the device."""
+    """`Renderer.render`, and `Rasterizer.forward` and `Rasterizer.backward`, whose arrays stay on the device."""
     renderer, rasterizer, camera = Renderer(device), Rasterizer(device), subject.camera
     gaussians = upload_gaussians(device, subject.gaussians)
     gradients = allocate_gaussians(device, gaussians.count, gaussians.coefficients, zero=True)
@@ -99,7 +99,10 @@ def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
 
 
 def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, Call, Call]:
-    """`clsplat.torch.rasterization` without and with preparation for a gradient, and its backward pass."""
+    """`clsplat.torch.rasterization` without and with preparation for a gradient, and its backward pass.
+
+    packed: its argument of this name.
+    """
     import torch
 
     from clsplat.torch import rasterization
@@ -132,9 +135,9 @@ def gradient_of(camera: Camera) -> Any:
 
 
 def measure(groups: list[tuple[Call, Call, Call]], repeat: int) -> list[Result]:
-    """The rows of the table. The other groups are compared with the first."""
+    """Time all calls, and return the rows of the table. The ratios are to the times of the first group."""
     times: dict[str, list[float]] = {name: [] for group in groups for name, _ in group}
-    for turn in range(repeat + 2):  # the first builds kernels and allocates memory
+    for turn in range(repeat + 2):  # the first two are a warm-up, which builds kernels and allocates memory
         for group in groups:
             for name, prepare in group:
                 work = prepare()
@@ -168,7 +171,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         groups += [of_torch(device, subject, packed=packed) for packed in (False, True)]
     except ModuleNotFoundError as error:
-        print(f"bench_library: {error}: without the rows of torch", file=sys.stderr)
+        print(f"bench_library: {error}: the table has no rows for PyTorch", file=sys.stderr)
     rows = measure(groups, options.repeat)
     result = {
         **machine(device, options.repeat),

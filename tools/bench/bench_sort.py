@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Time of the sort against the number of keys, beside NumPy's stable argsort of the same keys.
+"""Measure how the time of the sort grows with the number of keys, beside NumPy's stable argsort of the same keys.
 
     python tools/bench/bench_sort.py [--max 3e7] [--repeat 5] [--device DEVICE] [--json] [--plot sort.svg]
 
@@ -57,7 +57,7 @@ def random_keys(n: int) -> UInt32:
 
 
 def random_pairs(n: int) -> tuple[UInt32, UInt32]:
-    """Bits of the depths (n / 4,) of Gaussians, and their tiles (n / 4, 4), blocks of 2 x 2; the same in every call."""
+    """Depths (n / 4,) of Gaussians as bits, and each one's block of 2 x 2 tiles (n / 4, 4); the same in every call."""
     rng = np.random.default_rng(n)
     count = n // SIDE**2
     depths = rng.uniform(2.0, 10.0, count).astype(np.float32).view(np.uint32)
@@ -67,14 +67,14 @@ def random_pairs(n: int) -> tuple[UInt32, UInt32]:
 
 
 def keys_case(device: Device, n: int) -> Case:
-    """The work of one sort of keys."""
+    """The `Case` of one sort of n keys."""
     keys, work = random_keys(n), Workspace(device)
     once = partial(sort, device, work, "keys", upload(device, keys), DEPTH_BITS)
     return once, once()[1].get, partial(np.argsort, keys, kind="stable")
 
 
 def pairs_case(device: Device, n: int) -> Case:
-    """The work of the pipeline's two sorts. NumPy puts the tiles in the order of depth beforehand."""
+    """The `Case` of the pipeline's two sorts of n pairs. NumPy orders the tiles by depth beforehand, untimed."""
     depths, tiles = random_pairs(n)
     by_depth = np.argsort(depths, kind="stable")
     work = Workspace(device)
@@ -103,7 +103,7 @@ def measure(device: Device, name: str, n: int, repeat: int) -> Result:
     """A row of the table. Raises ClsplatError if the order is not NumPy's."""
     work, ours, by_numpy = CASES[name](device, n)
     if not np.array_equal(ours(), by_numpy()):  # this also builds the kernels and allocates the arrays
-        raise ClsplatError(f"{name}: the order of {n} differs from NumPy's")
+        raise ClsplatError(f"{name}: the order of {n} differs from NumPy's, expected the same")
     times, numpy_times = [], []
     for _ in range(repeat):  # alternating, so that other load affects both
         times.append(device.timed(work)[1])

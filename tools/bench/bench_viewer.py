@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time to the first picture on the viewer's page, and pictures per second while the camera moves.
+"""Measure the time to the first picture on the viewer's page, and pictures per second while the camera moves.
 
 `clsplat view` serves a run, a model file, or a synthetic model of --gaussians. A headless Chromium without a GPU opens
-it, and draws the page on the same cores. Times are from the request for the page until a picture is passed to WebGL.
-The time until viser's page has its canvas, before it connects, is printed too. Needs the extras `view` and
-`test` (playwright), and a chromium on the path (Debian: apt install chromium).
+the page, and draws it on the same cores. Times are from the request for the page until a picture is passed to WebGL.
+Also prints the time until viser's page has its canvas, before the page connects to the server. Needs the extras `view`
+and `test` (playwright), and a chromium on the path (Debian: apt install chromium).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FLAGS = {
 """Chromium's flags for WebGL on the CPU, by name: the system's llvmpipe, or the library that comes with
 Chromium."""
 PLAIN = "--webgl-antialiasing-mode=none"
-"""Scale of the page. Without it, each pixel of the page would be four, which is slow on a CPU."""
+"""Chromium's flag against antialiasing in WebGL, which is slow on a CPU."""
 WATCH = """
 window.pictures = [];
 for (const kind of [WebGL2RenderingContext, WebGLRenderingContext])
@@ -60,7 +60,10 @@ new MutationObserver(() => {
 
 
 def made_up(count: int) -> Gaussians:
-    """Blobs in a ball of radius 1, about as large as in a trained model of `count`, of SH degree 3."""
+    """A model of `count` random Gaussians in a ball of radius 1, with SH of degree 3.
+
+    They are about as large as those of a trained model of so many Gaussians.
+    """
     rng = np.random.default_rng(0)
     means = rng.normal(size=(count, 3))
     means *= (rng.uniform(0.05, 1, count) ** (1 / 3) / np.linalg.norm(means, axis=1))[:, None]
@@ -71,7 +74,7 @@ def made_up(count: int) -> Gaussians:
 
 
 def processor_seconds(process: int) -> float:
-    """CPU time of a process and of its running descendants, on Linux; 0 on other systems."""
+    """CPU time of the process with this number and of its running descendants, on Linux; 0 on other systems."""
     used, parents = {}, {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -87,7 +90,7 @@ def processor_seconds(process: int) -> float:
 
 
 def visit(browser: Any, url: str, server: int) -> dict[str, float]:
-    """Open the page once, move its camera, and return the measurements."""
+    """Open the page once, move its camera, and return the measurements. server: number of the server's process."""
     page = browser.new_page(viewport=WINDOW)
     page.add_init_script(WATCH)
     page.goto(url, wait_until="commit")
@@ -99,7 +102,7 @@ def visit(browser: Any, url: str, server: int) -> dict[str, float]:
     page.mouse.click(300, 300)
     server_before, before_all = processor_seconds(server), processor_seconds(os.getpid())
     before, start = page.evaluate("[window.pictures.length, performance.now()]")
-    page.keyboard.down("ArrowLeft")  # turns in every frame; a mouse would wait until the page handles its moves
+    page.keyboard.down("ArrowLeft")  # turns the camera in every frame; a mouse's moves would wait for the page
     page.wait_for_timeout(1000 * TURN)
     end, moved = page.evaluate("[performance.now(), window.pictures]")
     served, used = processor_seconds(server) - server_before, processor_seconds(os.getpid()) - before_all
@@ -119,7 +122,7 @@ def visit(browser: Any, url: str, server: int) -> dict[str, float]:
 
 
 def bench(model: Path, device: str | None, repeat: int, flags: tuple[str, ...]) -> list[dict[str, float]]:
-    """Measurements of `repeat` visits to the page, after a warm-up visit."""
+    """Measurements of `repeat` visits to the page, after a warm-up visit. flags: Chromium's, for WebGL."""
     from playwright.sync_api import sync_playwright
 
     path = chromium_path()
@@ -135,7 +138,7 @@ def bench(model: Path, device: str | None, repeat: int, flags: tuple[str, ...]) 
 
 @measuring.tool("bench_viewer")
 def main(arguments: Sequence[str]) -> int:
-    """Print the table, or JSON."""
+    """Run the measurement and print its results."""
     parser = measuring.options_parser(__doc__)
     parser.add_argument("model", metavar="RUN|MODEL.ply", type=Path, nargs="?")
     parser.add_argument("--gaussians", type=measuring.number, default=100_000)

@@ -1,6 +1,8 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Render a CG sphere into a shot like another renderer, for docs/shot.md: beauty, depth and deep EXR of each frame.
+"""Render a CG sphere for a shot's cameras, in place of another renderer, for docs/shot.md.
+
+Each frame has three EXR files: beauty, depth and deep samples.
 
     .venv/bin/python tools/bench/cg_sphere.py shot.json --centre 0,0,0 --radius 0.5 -o cg
 
@@ -56,8 +58,10 @@ def main(arguments: list[str]) -> int:
 def cast(
     camera: Camera, centre: NDArray[Any], radius: float
 ) -> tuple[NDArray[Any], list[list[list[float]]], NDArray[Any]]:
-    """Beauty (H, W, 4), a sample of alpha and mean depth in each pixel that is hit, and the nearest depth (H, W),
-    infinite in other pixels."""
+    """Beauty (H, W, 4), deep samples and nearest depths (H, W) of a sphere.
+
+    A pixel in which a ray hits the sphere has one deep sample [alpha, mean depth]; others have none and infinite depth.
+    """
     middle = camera.rotation @ centre + camera.translation
     fine = camera.resized(camera.width * FINE, camera.height * FINE)
     x, y = (np.arange(fine.width) + 0.5 - fine.cx) / fine.fx, (np.arange(fine.height) + 0.5 - fine.cy) / fine.fy

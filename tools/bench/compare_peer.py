@@ -14,8 +14,8 @@ blending's arithmetic allows if everything is in registers. The limit was 5.09 G
 cores and vectors of 16 lanes. --limit is a program, with its arguments, that prints `... N Gpairs/s` for this machine.
 It runs after every second step, and its median is used, so that other load slows it like the steps. Short runs suffice
 (20000 repetitions of limit.c). Build the program for the vectors that the machine has: with wider ones it is too slow,
-and the peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, and
-the faster of the two is used. (On AVX-512, with vectors of 16, the kernel does a quarter more than limit.c, as it needs
+and the peer would look slower than it is. For the same reason clsplat's own kernel for this limit is measured too, and
+the higher limit is used. (On AVX-512, with vectors of 16, the kernel does a quarter more than limit.c, as it needs
 fewer operations per pair; its speed on the peer's machine is unknown.) --limit-gpairs replaces the program by a known
 limit.
 """
@@ -68,7 +68,7 @@ FIRST, LAST = 3, 30
 
 
 def open_scene(folder: Path) -> tuple[Scene, Peer]:
-    """The scene that the peer trained. Raises InputError if pictures or points differ."""
+    """The scene that the peer trained, and the peer's figures. Raises InputError if pictures or points differ."""
     scene = load_scene(folder)
     peer = PEERS.get(scene.name)
     if peer is None:
@@ -83,8 +83,10 @@ def open_scene(folder: Path) -> tuple[Scene, Peer]:
 
 
 def step_and_limit(scene: Scene, device: Device, program: str | None) -> tuple[float, float | None]:
-    """Median milliseconds of a training step, and of the limit that the program prints between the steps, in Gpairs/s.
-    Raises InputError."""
+    """Median time of a training step in milliseconds, and the median limit in Gpairs/s, None without a program.
+
+    The program prints the limit between steps. Raises InputError.
+    """
     trainer = Trainer(scene, TrainConfig(warmup=()), device)
     for index in range(len(trainer.views)):
         trainer.photographs.load(index, 1)
@@ -109,7 +111,10 @@ def limit_of(program: str) -> float:
 
 
 def measure(folder: Path, device: Device, program: str | None, known: float | None) -> Result:
-    """A row of the table. Times are in seconds except for `ms`; limits are in Gpairs/s."""
+    """A row of the table. Times are in seconds except for `ms`; limits are in Gpairs/s.
+
+    program: prints the limit. known: the limit, if no program is given.
+    """
     scene, peer = open_scene(folder)
     ms, printed = step_and_limit(scene, device, program)
     limits: dict[str, float] = {}

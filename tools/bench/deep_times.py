@@ -75,7 +75,7 @@ def main(arguments: list[str]) -> int:
             totals.append(time.monotonic() - start)
         used = (time.process_time() - used) / options.repeats
         most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        device = open_device(options.device, profile=True)  # profiling events take memory
+        device = open_device(options.device, profile=True)  # only now, as profiling events take memory
         renderer = Renderer(device)
         for _ in range(options.repeats):
             with device.recorder.recording(wait=False) as stages:
@@ -93,14 +93,14 @@ def main(arguments: list[str]) -> int:
     print(
         f"{camera.width}x{camera.height}, {options.bins} slices, {samples:,} samples: {total:.2f} s, kernels "
         f"{kernel:.2f} s, OpenEXR's writer {write:.2f} s ({'the same bytes' if same else 'OTHER BYTES'}); "
-        f"{total / kernel:.2f} of the kernels, {total / (kernel + write):.2f} of both; processor time "
-        f"{used:.2f} s, the writer's {statistics.median(of_writer):.2f} s; {most / 2**20:.0f} MiB"
+        f"{total / kernel:.2f} times the kernels, {total / (kernel + write):.2f} times kernels and writer; CPU time "
+        f"{used:.2f} s, the writer's {statistics.median(of_writer):.2f} s; peak memory {most / 2**20:.0f} MiB"
     )
     return int(not same)
 
 
 def _written(path: Path, again: Path, spec: Any) -> tuple[float, float]:
-    """Wall and CPU seconds of writing the samples of a file."""
+    """Write the samples of the deep EXR `path` to the file `again`. Returns the wall and CPU seconds of writing."""
     image = oiio.ImageBuf(str(path))
     data = image.deepdata()
     start, used = time.monotonic(), time.process_time()

@@ -91,7 +91,7 @@ def show(result: Result, lines: Sequence[str], *, as_json: bool) -> None:
 
 
 def tool(name: str) -> Callable[[Callable[[Sequence[str]], int]], Callable[[Sequence[str]], int]]:
-    """Decorator of a tool's main function. It reports errors in one line, like the command line."""
+    """Decorator of a tool's main function. It reports errors in one line and returns a status, as `clsplat` does."""
 
     def decorated(work: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str]], int]:
         @wraps(work)

@@ -80,12 +80,12 @@ def main(arguments: list[str]) -> int:
 
 
 def report(title: str, score: float, count: int, began: float) -> None:
-    """One line of a training."""
+    """Print a training's line. began: time.perf_counter() at its start."""
     print(f"{title}: {score:.2f} dB, {count:,} Gaussians, {time.perf_counter() - began:.0f} s", flush=True)
 
 
 def psnr(render: Callable[[View], Tensor], scene: Scene) -> float:
-    """Mean PSNR of the held-out views in dB."""
+    """Mean PSNR of the held-out views in dB. render: draws a view, (H, W, 3)."""
 
     def image(view: View) -> Any:
         with torch.no_grad():
@@ -136,7 +136,7 @@ def own_loop(scene: Scene, given: argparse.Namespace) -> Params:
 
 
 def scaled(steps: int, given: argparse.Namespace) -> int:
-    """Scale one of gsplat's numbers of steps to this training."""
+    """A number of steps among gsplat's settings, scaled to this training by --steps-scaler."""
     return max(1, int(steps * given.steps_scaler))
 
 
@@ -181,7 +181,7 @@ def optimizers_of(params: Params, extent: float) -> dict[str, torch.optim.Optimi
 
 
 def picture(params: Params, view: View, degree: int, *, packed: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """A view of the model: images (1, H, W, 3), alphas, and what a strategy needs."""
+    """Render a view of the model: images (1, H, W, 3), alphas, and the dict that a strategy reads. degree: of SH."""
     camera = view.camera
     pose = torch.eye(4)
     pose[:3, :3] = torch.from_numpy(camera.rotation)

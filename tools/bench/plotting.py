@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots of the tools: growth, errors, parts of a step. Legible at a width of 800 pixels, like the plots of `bench`."""
+"""Plots of the tools: growth, errors, parts of a step. Like those of `bench`, they are legible 800 pixels wide."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Every kernel under Oclgrind: reads and writes out of bounds, data races, values read before they are written.
+"""Check every kernel with Oclgrind: reads and writes out of bounds, data races, values read before they are written.
 
     python tools/ci/check_memory.py [--short] [--shapes 1x64,8x1] [--jobs N] [--keep FOLDER]
 
 Runs `memory_workload.py` in child processes whose only device is Oclgrind's (Debian and Ubuntu: apt install oclgrind),
 once for bounds, races and API calls, and once for uninitialised values. Prints each finding with its kernel and line.
 With --short, as in CI, pictures are of one tile or two, training's methods take one step, and the parts of WHOLE_ONLY
-are left out: every kernel runs in every build (`-D` options) that it has without. The exit status is 0 if nothing was
-found, 2 without Oclgrind, and 1 if there are findings, if a kernel never ran, if a part that --short leaves out has a
-build of its own, or if a planted fault was missed.
+are left out. Every kernel still runs in every build (`-D` options) that it has without --short. The exit status is 0
+if nothing was found, and 2 without Oclgrind. It is 1 if there are findings, or if a planted fault was missed. It is 1
+also if a kernel never ran, or if a part that --short leaves out has a build of its own.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ STARTS = r"^(?=Invalid |Uninitialized |Controlflow |\S+-\S+ data race|Oclgrind|O
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of Oclgrind, without numbers that differ from run to run. kernel, place: empty if it names none."""
+    """A finding of Oclgrind, without numbers that differ from run to run. kernel, place: empty if not named in it."""
 
     message: str
     kernel: str = ""
@@ -84,7 +84,7 @@ def library() -> Path | None:
 
 
 def kernels() -> dict[str, list[str]]:
-    """Stems of the files with a kernel, keyed by its name. Files that share a header have kernels of the same name."""
+    """Stems of the kernel files, keyed by kernel. Files that share a header may have a kernel of the same name."""
     pattern = re.compile(r"__kernel\s+void\s+(\w+)\s*\(")
     found: dict[str, list[str]] = {}
     for path in sorted(kernel_root().glob("*.cl")):
@@ -113,7 +113,7 @@ def places(stem: str) -> list[str]:
 
 
 def findings(log: str, stems: Mapping[str, Sequence[str]]) -> tuple[Counter[Finding], Counter[str]]:
-    """Count the findings in a log, and the reasons of the ignored findings."""
+    """Count the findings in a log, and the reasons of the ignored findings. stems: from `kernels`."""
     found: Counter[Finding] = Counter()
     accepted: Counter[str] = Counter()
     for text in re.split(STARTS, log, flags=re.MULTILINE):
@@ -145,7 +145,10 @@ class Result:
 
 
 def run(shape: str, check: str, part: str, driver: Path, folder: Path, *, short: bool = False) -> Result:
-    """Run a part of the workload in a child process whose only device is Oclgrind's."""
+    """Run a part of the workload in a child process whose only device is Oclgrind's.
+
+    check: a key of CHECKS. driver: Oclgrind's. folder: gets the log. short: True for the short form of --short.
+    """
     vendors = folder / "vendors"
     vendors.mkdir(exist_ok=True)
     (vendors / "oclgrind.icd").write_text(f"{driver}\n")
@@ -160,7 +163,7 @@ def run(shape: str, check: str, part: str, driver: Path, folder: Path, *, short:
         "OCLGRIND_MAX_ERRORS": "10000",
         "OCLGRIND_GLOBAL_MEM_SIZE": str(1 << 30),
         "OCLGRIND_NUM_THREADS": "1",
-        "CLSPLAT_TRUST_DRIVER": "1",  # this process is the trial
+        "CLSPLAT_TRUST_DRIVER": "1",  # no sandbox, as a crash ends only this child process
         "PYOPENCL_NO_CACHE": "1",  # one check must not load the builds of the other from the cache
         "PYTHONPATH": os.pathsep.join(filter(None, (str(WORKLOAD.parents[2]), os.environ.get("PYTHONPATH", "")))),
     }
@@ -173,7 +176,7 @@ def run(shape: str, check: str, part: str, driver: Path, folder: Path, *, short:
 
 
 def report(result: Result, stems: Mapping[str, Sequence[str]]) -> bool:
-    """Print the findings of a child process. Returns True if there are none."""
+    """Print the findings of a child process. Returns True if there are none. stems: from `kernels`."""
     found, accepted = findings(result.log, stems)
     print(f"{result.name}: {sum(found.values())} findings, {result.seconds:.0f} s")
     for reason, count in accepted.items():
@@ -204,14 +207,15 @@ def report_builds(builds: Mapping[tuple[str, str], set[str]], kernels: set[str])
     """Print the kernels that never ran, and the builds that the short form would leave out. Returns True if there are
     none.
 
-    builds: "SHAPE KERNEL@BUILD" of what ran, keyed by check, and by "short", or "whole" for what the short form leaves
-        out.
+    builds: sets of "SHAPE KERNEL@BUILD" that ran, keyed by check and form. The form is "short" for parts that run with
+        --short, "whole" for parts that it leaves out.
+    kernels: names of all kernels.
     """
     clean = True
     for check in CHECKS:
         short, whole = (builds.get((check, form), set()) for form in ("short", "whole"))
         never = kernels - {each.split()[1].partition("@")[0] for each in short | whole}
-        if never:  # some kernels are built only in some shapes
+        if never:  # in no shape, as some kernels are built only in some shapes
             print(f"{check}, never ran: {', '.join(sorted(never))}")
         for build in sorted(whole - short):
             print(f"{check}, the short form would leave out: {build}")
@@ -250,7 +254,7 @@ def main(arguments: list[str]) -> int:
             clean &= report_planted(result, check)
             continue
         clean &= report(result, stems)
-        # with the shape, as each has builds of its own
+        # with the shape, as each shape has builds of its own
         ran = {f"{shape} {word}" for word in result.output.split()}
         builds.setdefault((check, "whole" if part in WHOLE_ONLY else "short"), set()).update(ran)
     clean &= report_builds(builds, set(stems))

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Table of drivers and kernel shapes: digests of frames, of gradients, of a trained model, and of pictures with every
-channel and camera model; or by how much they differ.
+"""Compare drivers and kernel shapes by digests of frames, of gradients, of a trained model, and of pictures with every
+channel and camera model.
 
     .venv/bin/python tools/ci/digests.py [--short]
 
@@ -12,8 +12,9 @@ Every driver found is run in every shape, in a process of its own: PoCL also wit
 Rusticl if CLSPLAT_RUSTICL names its libRusticlOpenCL.so. The exit status is 1 if
 
 - a frame or a channel of a picture has other bits anywhere,
-- gradients differ within a shape or between those of SAME_ORDER, or between other shapes by more than GRADIENT_BOUND,
-- two trainings on one driver differ in a bit, or those of two drivers in one shape,
+- gradients differ in a bit within a shape or between the shapes SAME_ORDER,
+- gradients of other shapes differ by more than GRADIENT_BOUND,
+- two trainings in one shape differ in a bit, on one driver or on two,
 - trainings in two shapes differ by more than PSNR_BOUND,
 - a combination that is expected to fail works, or another fails.
 """
@@ -77,8 +78,10 @@ PSNR_BOUND = 0.2
 class Row:
     """One driver in one shape: digests of frame, gradient and model (None if not trained).
 
-    repeats: True if a second training gave the same bytes. psnr: of the held-out views.
-    difference: relative difference of the gradient from the first row's, in norm. trouble: what went wrong, as text.
+    repeats: True if a second training gave the same bytes; None if not trained. psnr: of the held-out views, in dB.
+    gaussians: number of the model's Gaussians.
+    difference: relative difference in norm of the gradient from that of the first row without trouble.
+    trouble: what went wrong, as text.
     pictures: digests, keyed by camera model and channel."""
 
     driver: str
@@ -135,8 +138,10 @@ def main(arguments: list[str]) -> int:
 
 
 def jobs(folder: Path, *, short: bool = False) -> list[Job]:
-    """Jobs of every driver in every shape. short: of drivers after the first, those of IN_SHORT alone, and of Rusticl
-    not the shape in which it hangs."""
+    """Jobs of every driver in every shape. folder: gets caches and .icd files of drivers.
+
+    short: drivers after the first run only in the shapes IN_SHORT, and Rusticl not in the shape in which it hangs.
+    """
     from opencl_drivers import use_every_driver
 
     use_every_driver()
@@ -182,7 +187,7 @@ def rusticl(library: Path, folder: Path) -> dict[str, str]:
 
 
 def run_all(listed: list[Job], folder: Path) -> list[Row]:
-    """Run jobs, two at a time, each in a process. Differences are to the first row of the shape to compare with."""
+    """Run jobs, two at a time, each in a process. Gradients are compared with the first row's that has no trouble."""
     from tiny import write_scene
 
     scene = write_scene(folder / "scene")
@@ -220,7 +225,8 @@ def _in_a_process(job: Job, arrays: Path, scene: Path) -> Row:
     if expected == UNKNOWN_METHOD:
         more = ["open"]
     command = [sys.executable, __file__, "child", str(job.index), job.shape, str(arrays), *more]
-    environment = {**os.environ, "CLSPLAT_TRUST_DRIVER": "1", **job.environment}  # this process is the trial
+    # no sandbox, as a crash ends only this child process
+    environment = {**os.environ, "CLSPLAT_TRUST_DRIVER": "1", **job.environment}
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=limit, check=False, env=environment
@@ -242,9 +248,9 @@ def _in_a_process(job: Job, arrays: Path, scene: Path) -> Row:
 
 
 def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
-    """Run on the device of this index, -1 for Rusticl's. Prints the digests and writes the gradients.
+    """Run on the device of this index, -1 for Rusticl's. Prints the digests, and writes the gradients to `arrays`.
 
-    scene: scene to train on, or none; "open" only opens the device, which launches a kernel.
+    scene: scene to train on; None if no model is trained. With "open", only the device is opened and a probe launched.
     """
     from golden_frames import arrays_of, checksum, pictures_of, trained
 
@@ -253,7 +259,7 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
     found = next(d for d in all_devices() if d.platform.name == "rusticl") if index < 0 else all_devices()[index]
     device = Device(found).with_shape(shape)
     if scene == Path("open"):
-        Device(found).kernels("probe")  # in the driver's default shape; a launch probes its vectors
+        Device(found).kernels("probe")  # the driver's default shape has vectors, which the device probes by a launch
         return
     made = arrays_of(device)
     frame = [part for each in made.values() for name in ("image", "transmittance") for part in each[name]]
@@ -272,7 +278,7 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
 
 
 def _difference(got: Any, wanted: Any) -> float:
-    """The largest relative difference, in norm, of all arrays."""
+    """The largest relative difference in norm between arrays of the same key."""
     return max(relative_error(got[key], wanted[key]) for key in wanted)
 
 
@@ -285,7 +291,7 @@ def problems(rows: list[Row]) -> list[str]:
         if row.trouble and not expected:
             found.append(f"{row.driver}, {row.shape}: {row.trouble}")
         elif expected and not row.trouble:
-            found.append(f"{row.driver}, {row.shape}: works, and was expected not to: take it from EXPECTED")
+            found.append(f"{row.driver}, {row.shape}: works, and was expected to fail: take it from EXPECTED")
     if not good:
         return [*found, "nothing was run"]
     first = good[0]
@@ -317,7 +323,7 @@ def problems(rows: list[Row]) -> list[str]:
 
 
 def other_channels(row: Row, first: Row) -> list[str]:
-    """Channels whose bits in a row differ from the first row."""
+    """Descriptions of a row's channels whose digests differ from those of the first row."""
     found = []
     for kind, wanted in first.pictures.items():
         for name, digest in wanted.items():

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run ten steps of four public programs that call gsplat, with clsplat in place of gsplat, and without CUDA.
 
-python tools/ci/gsplat_programs.py --programs DIR        # has a checkout of each, by the names in PROGRAMS
+python tools/ci/gsplat_programs.py --programs DIR        # DIR has a checkout of each, named as in PROGRAMS
 
 Each program's own model, loss and loop run; the few lines below give it Gaussians and cameras. In its sources `cuda` is
 replaced by `cpu`. Modules that it imports but does not call here (file readers, viewers, other CUDA rasterizers) may be
-missing; GsplatLoc calls kornia and small_gicp. Prints the commit, and the first and last loss. The exit status is 1 if
-a program fails or its loss does not fall.
+missing. GsplatLoc does call kornia and small_gicp, and needs them. Prints the commit, and the first and last loss. The
+exit status is 1 if a program fails or its loss does not fall.
 """
 
 from __future__ import annotations
@@ -52,8 +52,12 @@ def said(step, loss): print(f"step {step}: loss {float(loss):.9g}", flush=True)
 
 @dataclass(frozen=True)
 class Program:
-    """A program: its folder in DIR, the subfolders that are put on the path, modules that may be missing, and lines
-    that run STEPS steps and print their losses. falls: True if the program trains."""
+    """A program: its folder in DIR, and lines that run STEPS steps and print their losses.
+
+    where: subfolder that is put on Python's path.
+    missing: modules that may be missing.
+    falls: True if the last loss has to be below the first, as in a training.
+    """
 
     folder: str
     where: str

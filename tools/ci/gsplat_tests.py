@@ -50,7 +50,7 @@ LEAST_ALPHA, LEAST_LIGHT = 1 / 255, 1e-4
 
 
 class Report:
-    """Counts of the tests' outcomes."""
+    """A plugin of pytest that seeds each test, and counts the tests' outcomes."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -146,8 +146,10 @@ def _install() -> None:
 
 
 def in_pieces(accumulate: Callable[..., tuple[Tensor, Tensor]]) -> Callable[..., tuple[Tensor, Tensor]]:
-    """gsplat's `accumulate`, on about AT_ONCE pairs at a time, in whole pixels. The gradient recomputes intermediate
-    results to save memory."""
+    """gsplat's `accumulate`, called for about AT_ONCE pairs at a time, those of a pixel in one call.
+
+    The gradient recomputes intermediate results to save memory.
+    """
 
     def call(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, *ids: Any) -> tuple[Tensor, Tensor]:
         *pairs, width, height = ids
@@ -198,8 +200,8 @@ def indices_in_range(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaussians, pixels and images of the pairs that contribute to the images. range_start, range_end: blocks of
-    tile_size^2 Gaussians in each tile's list. Pairs are in the order of images and pixels, front to back."""
+    """Gaussians, pixels and images of the pairs that contribute to the images, in order of images and pixels, front to
+    back. range_start, range_end: the first and one past the last block of tile_size^2 Gaussians in each tile's list."""
     rows, columns = isect_offsets.shape[-2:]
     count, images = means2d.shape[-2], means2d.shape[:-2].numel()
     ends = torch.cat([isect_offsets.flatten(), torch.tensor([len(flatten_ids)])]).tolist()

@@ -26,8 +26,11 @@ TAIL = 25
 
 @dataclass(frozen=True)
 class Step:
-    """A command that a machine runs. status: the expected exit status. says: text in its only line on standard error,
-    if any is expected. without: text that its output must not contain."""
+    """A command that a machine runs. limit: its time limit in seconds. status: the expected exit status.
+
+    says: text that the last line on standard error must contain.
+    without: text that the output must not contain.
+    """
 
     name: str
     command: tuple[str, ...]
@@ -42,9 +45,16 @@ Drivers = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class Machine:
-    """A row of the table. drivers: names and contents of the .icd files. pypi: True to keep PyPI's PoCL visible.
-    wrap: words before each command. missing: the reason why the machine cannot run, or empty. prepare: called with the
-    machine's folder before the first step. home, temporary: folders, relative to that folder or absolute."""
+    """A row of the table.
+
+    drivers: names and contents of the .icd files.
+    pypi: True to keep PyPI's PoCL visible.
+    variables: environment variables and their values.
+    wrap: words before each command.
+    missing: the reason why the machine cannot run, or empty.
+    prepare: called with the machine's folder before the first step.
+    home, temporary: HOME and TMPDIR, relative to the machine's folder or absolute.
+    """
 
     name: str
     purpose: str
@@ -162,7 +172,7 @@ def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
     if step.says and not (lines and step.says in lines[-1]):
         return f"its last line is {lines[-1] if lines else 'empty'!r}, expected {step.says!r} in it"
     if step.without in output:
-        return f"printed {step.without!r}"
+        return f"printed {step.without!r}, expected an output without it"
     return ""
 
 

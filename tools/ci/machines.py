@@ -7,13 +7,14 @@
 
 All machines share this Python environment. They differ in drivers, environment variables, user, and the place of the
 home folder, which is new, so that every driver is used for the first time. --list prints the machines' names, --only
-selects some, --full runs all of tools/test on some, --short leaves out machines whose drivers are in `all` and runs the
-smoke tests on few, --jobs sets how many run at once, and --markdown prints the table for docs/machines.md.
+selects some, and --full runs all of tools/test on some. --short leaves out machines whose drivers the machine `all`
+has, and runs the smoke tests on few. --jobs sets how many run at once, and --markdown prints the table for
+docs/machines.md.
 
-PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL through CLSPLAT_DEBIAN_POCL (its
-libpocl.so) or in the system's list, Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so), and Debian's QEMU
-through CLSPLAT_QEMU (its program) or on the path. A machine whose parts are missing is "not run", with the reason. The
-exit status is 1 if one failed. docs/machines.md has the purpose of each.
+PyPI's PoCL and Intel's runtime are found in this environment. Debian's PoCL is found through CLSPLAT_DEBIAN_POCL (its
+libpocl.so) or in the system's list, and Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so). Debian's QEMU is
+found through CLSPLAT_QEMU (its program) or on the path. A machine whose parts are missing is "not run", with the
+reason. The exit status is 1 if one failed. docs/machines.md has the purpose of each.
 """
 
 from __future__ import annotations
@@ -92,8 +93,10 @@ output. Rusticl therefore uses 1x64 by default, and the self-test refuses shapes
 
 
 def smoke(*, stages: bool = True) -> Step:
-    """The step of the smoke tests, from only the files that have any: collecting all tests takes 10 s more. stages:
-    also test single kernels. If only user or paths differ, the self-test has already run them on the same driver."""
+    """The step of the smoke tests, from only the files that have any: collecting all tests takes 10 s more.
+
+    stages: also test single kernels. False if only user or paths differ, as the self-test has run these kernels.
+    """
     pytest = (PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=short")
     files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.smoke" in path.read_text("utf-8"))
     names = [str(path.relative_to(ROOT)) for path in files if stages or path.parent.name != "stages"]
@@ -102,8 +105,8 @@ def smoke(*, stages: bool = True) -> Step:
 
 
 def full() -> Step:
-    """The step of the quick tests. It uses the caller's cached binaries for Intel's runtime, as building all would take
-    minutes; earlier steps build their own."""
+    """The step of the quick tests. It uses the binaries for Intel's runtime that the caller has cached, as building all
+    of them would take minutes. Earlier steps do not use this cache."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     binaries = os.environ.get("CLSPLAT_BINARIES") or str(cache / "clsplat" / "binaries")
     command = ("env", f"CLSPLAT_BINARIES={binaries}", PYTHON, "tools/test", "--quiet")
@@ -159,7 +162,7 @@ def look() -> Found:
 
 
 def machines(found: Found) -> list[Machine]:
-    """Every row."""
+    """The machines of all rows. found: from `look`."""
     usual, elsewhere = (short_test(), smoke()), smoke(stages=False)
     no_pypi = "" if found.pypi else "pyopencl brings no PoCL here"
     no_debian = "" if found.debian else "the distribution's PoCL is missing"
@@ -169,12 +172,15 @@ def machines(found: Found) -> list[Machine]:
     no_avx512 = "" if found.avx512 else "this processor has no AVX-512"
 
     def alone(name: str, purpose: str, drivers: Drivers, missing: str, **variables: str) -> Machine:
-        """A machine with these drivers alone; without any it has what pip brings."""
+        """A machine with these drivers alone, or with PyPI's PoCL if there are none. variables: of its environment."""
         own = tuple(variables.items())
         return Machine(name, purpose, usual, drivers, pypi=not drivers, variables=own, missing=missing)
 
     def at_home(name: str, purpose: str, *steps: Step, **changes: Any) -> Machine:
-        """A machine with what pip brings, for another user or in another place. steps: those before the smoke tests."""
+        """A machine with PyPI's PoCL, for another user or in another place. steps: those before the smoke tests.
+
+        changes: other fields of `Machine`.
+        """
         tests = (short_test(), *steps, elsewhere)
         return Machine(name, purpose, tests, pypi=True, **{"missing": no_pypi, **changes})
 
@@ -238,10 +244,13 @@ def machines(found: Found) -> list[Machine]:
 
 
 def emulated(found: Found, missing: str) -> Machine:
-    """A processor without AVX-512, which PyPI's PoCL recognises."""
+    """A machine with an emulated processor without AVX-512, for which PyPI's PoCL builds kernels.
+
+    missing: the reason why PyPI's PoCL is missing, or empty.
+    """
 
     def write_interpreter(folder: Path) -> None:
-        # features of Haswell that TCG lacks, which would cause a warning in every process
+        # without features of Haswell that QEMU cannot emulate, which would cause a warning in every process
         processor = "Haswell,-pcid,-x2apic,-tsc-deadline,-hle,-invpcid,-rtm"
         command = shlex.join([found.qemu, "-cpu", processor, PYTHON])
         script = folder / "python"
@@ -270,7 +279,7 @@ def emulated(found: Found, missing: str) -> Machine:
 
 
 def no_driver() -> tuple[Step, ...]:
-    """A machine without drivers, on which each verb that needs a device must say what to install."""
+    """The steps of a machine without drivers: each verb that needs a device must say what to install."""
     install = "pip install 'pyopencl[pocl]'"
     scene, train = ten_steps("{folder}/made")
     return (
@@ -282,7 +291,10 @@ def no_driver() -> tuple[Step, ...]:
 
 
 def read_only_home(found: Found, machine: Machine) -> Machine:
-    """A home on a read-only mount, which root cannot write either; without mounts, a home that cannot be created."""
+    """The machine with its home on a read-only mount, to which root cannot write either.
+
+    If mounts are not allowed, the home cannot be created instead.
+    """
     if found.mounts:
         script = 'mount --bind "$1" "$1" && mount -o remount,ro,bind "$1" && shift && exec "$@"'
         return replace(machine, wrap=(*found.mounts, "sh", "-c", script, "sh", "{folder}/home"))
@@ -293,17 +305,17 @@ def read_only_home(found: Found, machine: Machine) -> Machine:
     return replace(machine, prepare=write_file, variables=(("HOME", "{folder}/file/home"),))
 
 
-def full_temporary(found: Found, alone: Machine) -> Machine:
-    """A full TMPDIR, for training outside it and in it."""
+def full_temporary(found: Found, machine: Machine) -> Machine:
+    """The machine with a full TMPDIR, with a training that writes elsewhere and one that writes into TMPDIR."""
     script = 'mount -t tmpfs -o size=64k none "$1" && { cat /dev/zero >"$1/filler" 2>/dev/null; shift; exec "$@"; }'
     scene, train = ten_steps("{folder}/made")
     command = tuple("{folder}/tmp/run" if word == "{folder}/made/run" else word for word in train.command)
     on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="the disk is full")
     return replace(
-        alone,
+        machine,
         wrap=(*found.mounts, "sh", "-c", script, "sh", "{folder}/tmp"),
         steps=(short_test(), scene, train, on_it),
-        missing=alone.missing or ("" if found.mounts else "mounts are not allowed here"),
+        missing=machine.missing or ("" if found.mounts else "mounts are not allowed here"),
     )
 
 
@@ -317,8 +329,8 @@ def _mounts() -> tuple[str, ...]:
 
 
 def _stranger() -> tuple[str, ...]:
-    """Command prefix for the user nobody. If the checkout or Python is in root's home, the user may read everything, so
-    that nothing has to be copied."""
+    """Command prefix for the user nobody; empty if not allowed. If the checkout or Python is in root's home, the user
+    may read everything, so that nothing has to be copied."""
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
     reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
     # also test a child process: setpriv itself can follow paths that its command cannot
@@ -379,7 +391,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def without_smoke(machine: Machine) -> Machine:
-    """A machine that does not run the smoke tests."""
+    """The machine without the step of the smoke tests."""
     return replace(machine, steps=tuple(step for step in machine.steps if step.name != SMOKE))
 
 

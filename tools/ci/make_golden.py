@@ -6,7 +6,7 @@ checksums of frames and gradients. Also write clsplat/selftest/digests.json, wit
     .venv/bin/python tools/ci/make_golden.py [loss_curve] [frames] [selftest]
 
 Run it and commit its files only after a change that is meant to change training, or the bits of frames or gradients;
-explain it in the commit. Without a name it writes all three files. The default device must support 16 lanes.
+explain the change in the commit. Without a name it writes all three files. The default device must support 16 lanes.
 
 tests/golden/README.md has the differences that the tests allow.
 """
@@ -73,7 +73,8 @@ ORDERED = ("/loss", "/masks", "/blend_grad", "/values")
 
 
 def write_selftest(path: Path) -> None:
-    """Run the self-test in every shape and write the digests: one for all shapes, but one per shape in ORDERED."""
+    """Run the self-test in every shape, and write the digests: one per result, but one per result and shape for the
+    stages in ORDERED."""
     device = open_device()
     by_shape: dict[str, dict[str, str]] = {}
     for label in SHAPES:

@@ -38,7 +38,7 @@ def library(device: Device) -> None:
         ((means, None, None, opacities), colours, {"covars": covars, "rasterize_mode": "antialiased"}),
     )
     for index, (gaussians, values, settings) in enumerate(calls):
-        cameras = slice(0, 2 if index == 0 else 1)  # a second camera adds to the gradients
+        cameras = slice(0, 2 if index == 0 else 1)  # two cameras, whose gradients are added, in one call
         views = (poses[cameras], lenses[cameras], width, height)
         result = rasterize(*gaussians, values, *views, device=device, **settings)
         gradients = result.vjp(np.ones_like(result.images), np.ones_like(result.alphas))

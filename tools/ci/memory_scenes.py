@@ -14,12 +14,12 @@ from clsplat.layouts.columns import CHUNK_ROWS
 
 @dataclass
 class Extent:
-    """Pictures and steps of the workload. Oclgrind takes most of its time for the pixels of blending and of the loss.
+    """Sizes of the workload's pictures, and numbers of steps. Blending and the loss take most of Oclgrind's time.
 
-    frame: of six tiles, or of two, one above the other. view: of four, or of two. low: of two, or of one. picture: of
-    six, or of one.
-    capacity: pairs of a band, of which `frame` then has several. steps: of each of training's methods. missed: steps
-    that a chunk has missed at most, of which `catch_up` takes 16 at a time.
+    frame, view, low, picture: sizes in pixels, of 6, 4, 2 and 6 tiles, or after `shorten` of 2, 2, 1 and 1.
+    capacity: number of pairs in a band, so small that `frame` has several bands.
+    steps: number of steps with each method of training.
+    missed: maximum number of steps that a chunk has missed; `catch_up` takes 16 of them at a time.
     """
 
     frame: tuple[int, int] = (33, 17)
@@ -31,7 +31,7 @@ class Extent:
     missed: int = 300
 
     def shorten(self) -> None:
-        """The least with which every kernel has every build."""
+        """Make everything as small as possible while every kernel still has all its builds."""
         self.frame = self.view = 9, 17
         self.low = self.picture = 9, 7
         self.capacity, self.steps, self.missed = 40, 1, 40
@@ -41,12 +41,12 @@ EXTENT = Extent()
 
 
 def camera(width: int, height: int) -> Camera:
-    """Looks along z, a little off the centre."""
+    """A camera at the origin that looks along z, with its principal point a little off the centre."""
     return Camera(width, height, 0.9 * width, 0.8 * width, 0.45 * width, 0.55 * height, np.eye(3), np.zeros(3))
 
 
 def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians:
-    """Gaussians of all sizes and opacities, some beside the image, behind the camera or too faint to show."""
+    """Gaussians of all sizes and opacities, some beside the view's image, behind its camera or too faint to show."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(1.5, 5.0, count)
     depth[::9] *= -1
@@ -63,8 +63,8 @@ def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians
 
 
 def mostly_behind(view: Camera) -> Gaussians:
-    """A model of three chunks: the last one, of 18 Gaussians, is in front of the camera, and the others are behind it,
-    beside its axis."""
+    """A model of three chunks, once its rows are ordered: the last, of 18 Gaussians, is in front of the camera, and the
+    others are behind it, beside its axis."""
     gaussians = cloud(2 * CHUNK_ROWS + 18, camera(view.width, view.height), 5, degree=0)
     gaussians.means[:, 2] = np.abs(gaussians.means[:, 2])
     gaussians.means[18:] += np.array([60, 0, -50], np.float32)

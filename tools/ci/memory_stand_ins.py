@@ -26,7 +26,7 @@ found: each is the cause of a crash or of findings."""
 
 
 def stand_in(lanes: int) -> None:
-    """Replace what STAND_INS lists. lanes: of the shape that is checked."""
+    """Replace what STAND_INS lists. lanes: those of the shape that is checked."""
     kept = []
 
     class Kept(buffers._Buffer):  # noqa: SLF001
@@ -58,8 +58,11 @@ def stand_in(lanes: int) -> None:
 
 
 def by_elements(source: str, lanes: int) -> str:
-    """Kernel source in which (float8)(a.lo, b.s01, ...) has .s0 and so on of every part, and LOAD_CELL and the mask of
-    image gradients are of elements too, line by line."""
+    """Kernel source in which vectors are made of elements: (float8)(a.s0, a.s1, ...) instead of (float8)(a.lo, ...).
+
+    LOAD_CELL and the mask of image gradients are replaced likewise. Every line keeps its number.
+    lanes: those of the shape.
+    """
     parts = r"\w+\.(?:lo|hi|s[0-9a-f]{2,8})"
     halves = {"lo": "0123", "hi": "4567"}
 
@@ -80,7 +83,7 @@ def by_elements(source: str, lanes: int) -> str:
     source = re.sub(gradient, masked, source)
     source = source.replace(
         "#define LANES 16\n", "#define LANES 8\n"
-    )  # the loss; halves of 16 floats are the same to it
+    )  # for the loss: two vectors of 8 floats give the same as one of 16
     loads = "((type##8)(LOAD4(type, p), LOAD4(type, (p) + (stride))))"
     each = [f"(p)[{i}]" for i in range(4)] + [f"(p)[(stride) + {i}]" for i in range(4)]
     return source.replace(loads, f"((type##8)({', '.join(each)}))")

@@ -4,9 +4,9 @@
 
     memory_workload.py planted|LANESxITEMS [plain] [short] [PART]
 
-Prints the name of each kernel and its build before it runs. `plain`: with the replacements that the check of
+Prints the name of each kernel and its build before the kernel runs. `plain`: with the replacements that the check of
 uninitialised reads needs with Oclgrind 21.10 (`memory_stand_ins.py`).
-`short`: with the least pictures and steps, see Extent.
+`short`: with the smallest pictures and the fewest steps (`Extent.shorten`).
 """
 
 from __future__ import annotations
@@ -67,11 +67,11 @@ __kernel void planted_bounds(__global float *out, const int n) { out[n + get_glo
 __kernel void planted_race(__global float *out) { out[0] = (float)get_global_id(0); }
 __kernel void planted_uninitialised(__global float *out, __global const float *in) { out[0] = in[1] > 0.0f; }
 """
-"""One fault of each kind that the check is there to find; it fails where it does not."""
+"""One fault of each kind that the check has to find. If it misses one, it fails."""
 
 
 def image_gradient(device: Device, frame: ForwardPass) -> DeviceArray:
-    """Random planes by an image of EXTENT.frame, zero in its padding."""
+    """A random gradient with respect to a frame of the size EXTENT.frame: four planes, zero in the padding."""
     width, height = EXTENT.frame
     planes = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
     planes[:, :height, :width] = np.random.default_rng(1).normal(size=(4, height, width))
@@ -79,7 +79,10 @@ def image_gradient(device: Device, frame: ForwardPass) -> DeviceArray:
 
 
 def frames(device: Device) -> None:
-    """Forward and backward: as trained, with every exact switch off, in bands, and the counting build."""
+    """Run forward and backward passes: as in training, with every exact switch off, and in bands.
+
+    Also run the build of blending that counts pairs.
+    """
     view = camera(*EXTENT.frame)
     gaussians, background = cloud(40, view), upload(device, np.array([0.1, 0.2, 0.3], np.float32))
     held = upload_gaussians(device, gaussians)
@@ -92,7 +95,7 @@ def frames(device: Device) -> None:
             rasterizer.capacity = EXTENT.capacity
         frame = rasterizer.forward(held, view, background, nearness=True)
         if small and len(frame.bands) < 2:
-            raise SystemExit("the frame in bands has one band only")
+            raise SystemExit("the frame in bands has one band only, expected several")
         gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
         screen = rasterizer.backward(held, frame, image_gradient(device, frame), gradients, fields=WIDEST_SLOTS)
         arrays = [*(gradients[group] for group in PARAMETER_GROUPS), screen.gradients, frame.blended.image]
@@ -107,10 +110,12 @@ def frames(device: Device) -> None:
 
 
 def subgroups(device: Device) -> None:
-    """The probe of sub-groups, and the gradient of blending with and without them in the shape's own groups, where
-    items are grouped: the few tiles of `frames` have the largest. Oclgrind has no sub-groups: an item stands for what
-    it should have got, so that the sums are wrong, but places and order of what is written are those of sub-groups
-    of 8."""
+    """Run the probe of sub-groups, and the gradient of blending with and without them, in the shape's own groups.
+
+    `frames` has so few tiles that its groups are larger. Shapes whose groups have one item have no sub-groups.
+    Oclgrind has no sub-groups either: an item's own value replaces the one that it should get from another item. So the
+    sums are wrong, but places and order of the writes are those of sub-groups of 8.
+    """
     if device.shape.items == 1:
         return
     opened, rows = (device.with_shape(f"{device.shape.label}{way}") for way in ("s", ""))
@@ -131,8 +136,10 @@ def subgroups(device: Device) -> None:
 
 
 def long_lists(device: Device) -> None:
-    """A list of several parts, which groups share in the gradient of blending, by as few pairs as the shape allows: a
-    part has a batch of the shape's own groups."""
+    """Run the gradient of blending on a list that is divided into several parts, one for each group.
+
+    Parts are as short as the shape allows: a batch of pairs.
+    """
     if device.shape.items == 1:
         return
     own, usual = device.with_shape(device.shape.label), stages_blend.PART_PAIRS
@@ -140,7 +147,7 @@ def long_lists(device: Device) -> None:
     stages_blend.PART_PAIRS = part = max(own.shape.items, 64)
     view = camera(9, 7)
     gaussians = cloud(4 * part, view, 2, degree=0)
-    gaussians.opacity_logits[:] = np.linspace(-5, -2, len(gaussians), dtype=np.float32)  # so that no pixel is full soon
+    gaussians.opacity_logits[:] = np.linspace(-5, -2, len(gaussians), dtype=np.float32)  # no pixel becomes opaque
     rasterizer, held = Rasterizer(own), upload_gaussians(own, gaussians)
     frame = rasterizer.forward(held, view, np.zeros(3, np.float32), nearness=True)
     planes = np.random.default_rng(1).normal(size=(5, *frame.blended.stops.shape)).astype(np.float32)
@@ -151,7 +158,7 @@ def long_lists(device: Device) -> None:
 
 
 def cases(device: Device) -> None:
-    """Cases of stages by themselves, on a few rows or pixels, some of them twice for their builds that differ."""
+    """Run the cases of single stages on a few rows or pixels, those with several builds several times."""
     for name, case in CASES.items():
         size = (17, 7) if isinstance(case.sizes[0], tuple) else 9
         twice = ("marks", "harmonics", "settle", "chunks", "catch_up")
@@ -159,7 +166,7 @@ def cases(device: Device) -> None:
             given = case.random(np.random.default_rng([draw, *name.encode()]), size)
             if name == "adam":
                 given.rows = ("all", "sparse", "late")[draw]
-            given.all_rows = given.sparse = draw == 1  # of settle, and of chunks
+            given.all_rows = given.sparse = draw == 1  # inputs of the cases settle and chunks
             if name == "catch_up":
                 given.rates = dict(sorted(given.rates.items())[: EXTENT.missed])
                 given.last = {chunk: min(step, max(given.rates) - 1) for chunk, step in given.last.items()}
@@ -171,13 +178,13 @@ def cases(device: Device) -> None:
 
 
 def check(name: str, case: Case, device: Device, given: Inputs) -> None:
-    """Raise SystemExit where a case is over its bounds."""
+    """Run a case. Raises SystemExit if its errors exceed their bounds. name: for the message."""
     if wrong := faults(case.errors(device, given)):
         raise SystemExit(f"{name}: {', '.join(wrong)}")
 
 
 def rendering(device: Device) -> None:
-    """Kernels that only rendering needs: fewer SH bands by Gaussian, half floats."""
+    """Run kernels that only rendering needs: fewer SH bands for some Gaussians, SH coefficients in half floats."""
     view = camera(*EXTENT.view)
     gaussians = cloud(27, view, 3)
     gaussians.sh[::2, 4:] = 0
@@ -186,7 +193,7 @@ def rendering(device: Device) -> None:
 
 
 def pictures(device: Device) -> None:
-    """Kernels that only pictures need: channels beside colour, slices by depth; cameras without an image plane."""
+    """Run kernels that only pictures need: channels beside colour, slices by depth, cameras without an image plane."""
     flat = camera(*EXTENT.picture)
     radius = flat.width / (2 * np.pi)
     around = replace(flat, fx=radius, fy=radius, projection="equirectangular")
@@ -204,7 +211,7 @@ def pictures(device: Device) -> None:
         if not all(np.isfinite(values).all() for values in (*found.values(), slices, several)):
             raise SystemExit(f"a channel of the {view.projection} camera is not finite")
         if not found["count"].any():
-            raise SystemExit(f"nothing is in the picture of the {view.projection} camera")
+            raise SystemExit(f"the picture of the {view.projection} camera is empty")
 
 
 PAPER = TrainConfig(
@@ -218,8 +225,8 @@ AHEAD = replace(PAPER, iterations=3, warmup=())
 
 
 def training(device: Device) -> None:
-    """Steps with statistics of every kind, after which Gaussians are cloned, split and pruned; and steps by capacity,
-    of which one has too little."""
+    """Run steps with statistics of every kind, after which Gaussians are cloned, split and pruned. Also run steps by
+    capacity, one of them with too small a capacity."""
     density = replace(PAPER.density, absolute_gradients=True, min_contribution=1e-3, prune_every=3, max_gaussians=60)
     wide = replace(PAPER, iterations=4, warmup=(), sh_degree=1, sh_degree_every=1, background="random")
     wide = replace(wide, optimiser=OptimiserConfig(sparse=True), density=density)
@@ -228,8 +235,8 @@ def training(device: Device) -> None:
 
 
 def more_training(device: Device) -> None:
-    """Steps in which everything happens: SH bands are added, the resolution doubles, opacities are reset. And methods
-    by themselves whose kernels `cases` has."""
+    """Run steps in which SH bands are added, the resolution doubles and opacities are reset. Also run steps with
+    methods whose kernels `cases` runs too."""
     _train(device, PAPER, 3, camera(*EXTENT.view))
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     _train(device, replace(short, appearance="ppisp"), 3, low)
@@ -238,17 +245,17 @@ def more_training(device: Device) -> None:
 
 
 def methods(device: Device) -> None:
-    """Steps of each of training's methods that has builds of its own, and by each kind of camera."""
+    """Run steps with each method of training that has builds of its own, and with each kind of camera."""
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     _train(device, replace(short, antialiased=True), 3, low)
     _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, low)
     _train(device, replace(short, appearance="exposure", masks="ignore"), 5, low)
-    # Of so small a scene points tell no gain, and none is pulled; the last photograph's row is the array's end.
+    # A scene this small gives no matrix that pulls gains; here is one. Row 2 is the last row of the arrays.
     gains = Gains.on(device, np.zeros((3, 3), np.float32), csr_array(np.ones((3, 3))))
     columns, readback = upload(device, np.ones((3, 16), np.float32)), upload(device, np.zeros(len(READBACK), np.uint32))
     step_gains(device, gains, 2, columns, 1, 1e-3, readback)
     gains.logs.get()
-    # One view is not held; sums of more than POSE_ROWS Gaussians take two kernels.
+    # Of three poses, two stay fixed. Sums over more than POSE_ROWS Gaussians take two kernels.
     refined = replace(short, refine_poses=True, refine_lenses=True, iterations=3)
     _train(device, refined, 3, low, views=3, count=POSE_ROWS + 1)
     _train(device, replace(short, depth="points"), 3, low)
@@ -262,7 +269,7 @@ def methods(device: Device) -> None:
 
 
 def chunks(device: Device) -> None:
-    """Steps over the chunk in view of a model that has two others, which then take the steps that they missed."""
+    """Run steps with a model of three chunks, one of which is in view. The other two then catch up."""
     for module in (visible_chunks, trained_model, moved_rows):
         vars(module)["ORDERED_ROWS"] = CHUNK_ROWS
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
@@ -275,7 +282,8 @@ def chunks(device: Device) -> None:
         trainer = _train(device, config, 3, view, initial=mostly_behind(view))
         (component,) = (each for each in trainer.components if isinstance(each, VisibleChunks))
         if component._last.tolist() != [0, 0, config.iterations]:  # noqa: SLF001
-            raise SystemExit(f"last steps of the chunks: {component._last.tolist()}")  # noqa: SLF001
+            told = f"last steps of the chunks: {component._last.tolist()}"  # noqa: SLF001
+            raise SystemExit(f"{told}, expected {[0, 0, config.iterations]}")
         trainer.catch_up()
         trainer.parameters["means"].get()
     for module in (visible_chunks, trained_model, moved_rows):
@@ -293,11 +301,11 @@ def _train(
 ) -> Trainer:
     pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
     if channels == 3:
-        pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
+        pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # such values go to the device as bytes
     if channels == 5:
         pixels[:, :, 4] = pixels[:, :, 4] > 0.3
     gaussians = cloud(count, camera(view.width, view.height), 5, degree=0)
-    gaussians.opacity_logits[18:] = -9  # as rows they count, and blending them would take most of the time
+    gaussians.opacity_logits[18:] = -9  # invisible: only their number matters, and blending them would take long
     trainer = Trainer(scene_of(view, pixels, views), config, device, initial or gaussians)
     trainer.pending.on = config is AHEAD
     if config is AHEAD:
@@ -305,14 +313,14 @@ def _train(
         trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
     losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
     if trainer.pending.redone != (config is AHEAD):
-        raise SystemExit(f"{trainer.pending.redone} steps were made again")
+        raise SystemExit(f"{trainer.pending.redone} steps were repeated, expected {int(config is AHEAD)}")
     if not np.isfinite(losses).all():
-        raise SystemExit(f"the training went wrong: losses {losses}")
+        raise SystemExit(f"the losses of a training are {losses}, expected finite numbers")
     return trainer
 
 
 def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene:
-    """A view, once or more often, its picture in memory at any size."""
+    """A scene of `views` equal views, whose picture is in memory. At a smaller size it is a part of the picture."""
 
     class Picture(_Picture):
         def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[NDArray[np.float32]]:  # noqa: ARG002
@@ -327,7 +335,7 @@ def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene
 
 
 def sorts(device: Device) -> None:
-    """The radix sort and scans with several groups and passes."""
+    """Run the radix sort and scans with several groups and passes."""
     rng, few = np.random.default_rng(4), stages_scan.MAX_SINGLE_CHUNK_ELEMENTS
     for alone, n, bits in ((few, 700, 20), (0, 2500, 13), (0, 77, 5), (few, 1, 1)):
         stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = alone
@@ -338,17 +346,17 @@ def sorts(device: Device) -> None:
 
 
 def lists(device: Device) -> None:
-    """Lists by append that local memory does not hold, and boxes that a group shares; the probe of its atomics."""
+    """Run lists by append that do not fit in local memory, boxes that a group shares, and the probe of atomics."""
     fits, stages_append.LOCAL_PAIRS = stages_append.LOCAL_PAIRS, 16
     rng = np.random.default_rng(2)
     check("lists by append", CASES["append"], device, CASES["append"].random(rng, 120))
     stages_append.LOCAL_PAIRS = fits
     if found := atomics_fault(device):
-        raise SystemExit(found)
+        raise SystemExit(f"the probe of atomics: {found}")
 
 
 def density(device: Device) -> None:
-    """Rows that are marked, listed and gathered, of a model on the device and of one on the host, in parts."""
+    """Mark, list and gather rows of a model on the device, and of one on the host, which is processed in parts."""
     count = 3 * device.row_alignment + 1
     gaussians = cloud(count, camera(20, 17), 9, degree=1)
     statistics = new_statistics(device, count, contributions=True)
@@ -360,12 +368,13 @@ def density(device: Device) -> None:
         if isinstance(model, DeviceGaussians) and isinstance(listed, DeviceRowList):
             gather(device, listed.rows, model, renews=True)["means"].get()
         if not 0 < listed.halves < listed.count or not np.isinf(after.named()["whole_totals"].get()).any():
-            raise SystemExit("nothing is split, or nothing is new")
+            told = f"{listed.halves} of {listed.count} rows are halves of splits"
+            raise SystemExit(f"{told}, expected some but not all, and infinite totals of new rows")
 
 
 def limits(device: Device) -> None:
-    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
-    tests and of the self-test."""
+    """Run a round of each kernel by which `clsplat bench` measures the device's limits, and the probes of the tests and
+    of the self-test."""
     items, lanes = tile_items(device), device.shape.lanes
     copied = max(lanes, 4)
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
@@ -387,7 +396,7 @@ def limits(device: Device) -> None:
 
 
 def planted(device: Device) -> None:
-    """Faults that Oclgrind has to find."""
+    """Run the faults of PLANTED, which Oclgrind has to find."""
     kernels = cl.Program(device.context, PLANTED).build(options=["-cl-std=CL1.2"])
     out, unwritten = allocate(device, (8,), np.float32), allocate(device, (8,), np.float32)
     for name, size, arguments in (
@@ -415,14 +424,15 @@ WHOLE_ONLY = ("more",)
 
 
 def build_of(kernel: Kernel) -> str:
-    """NAME@STEM,DEFINE,...: what is run, as a word."""
+    """A kernel and its build as one word: NAME@STEM,DEFINE,..."""
     variant = kernel.variant
     defines = [option.removeprefix("-D") for option in variant.options if option.startswith("-D")]
     return f"{kernel.name}@{','.join([variant.stem, *sorted(defines)])}"
 
 
 def note_kernels() -> None:
-    """Print name and build of each kernel when it is put on the queue, and wait for it: a crash is the last one's."""
+    """Print name and build of each kernel before its launch, and wait for its end, so that a crash is that of the last
+    kernel printed."""
     real = launch._enqueue  # noqa: SLF001
 
     def noted(
@@ -450,9 +460,9 @@ def main(arguments: list[str]) -> int:
     if "short" in arguments[1:]:
         EXTENT.shorten()
     opened = Device(device, shape)
-    print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
+    print("probe_fma", flush=True)  # a device with lanes runs it before its first kernel, without `launch`
     if shape.items == 1:
-        opened.kind = "cpu"  # the launches too are then those of a CPU
+        opened.kind = "cpu"  # so that kernels are launched as on a CPU
     for name in arguments[1:]:
         for part in PARTS.get(name, ()):
             part(opened)

@@ -43,7 +43,7 @@ def table() -> str:
 
 
 def page(text: str) -> str:
-    """The text of the page with the current table."""
+    """The page's text with the current table. text: the page's text so far."""
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
     return before + BEGIN + table() + END + after

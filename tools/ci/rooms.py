@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The table of packages in docs/architecture.md, from the import contracts and the packages' docstrings.
+"""Make the table of packages in docs/architecture.md, from the import contracts and the packages' docstrings.
 
     python3 tools/ci/rooms.py [--write]
 
 Prints the table; --write puts it into the page. The order of packages is that of `[tool.importlinter]` in
-pyproject.toml, from the top. Inside a package with a contract of its own, a module imports only modules behind it.
+pyproject.toml, from the top. Inside a package with a contract of its own, a module imports only modules listed behind
+it.
 """
 
 from __future__ import annotations

@@ -69,13 +69,13 @@ def rows_of(report: Mapping[str, Any]) -> tuple[list[Row], list[str]]:
 
 
 def bits_of(device: Mapping[str, Any]) -> str:
-    """`same`, or text with the stages whose bits differ from the stored ones."""
+    """`same`, or text with the stages whose results have other bits than those stored with clsplat."""
     other = [stage["stage"] for stage in device["stages"] if stage["same_bits"] is False]
     return f"other in {', '.join(other)}" if other else "same"
 
 
 def merged(rows: Sequence[Row], new: Sequence[Row]) -> list[Row]:
-    """All rows, where new rows replace old ones with the same KEY. GPUs come first, and the quickest of them."""
+    """All rows, where new rows replace old ones with the same KEY. GPUs come first, and fast before slow devices."""
     found = {tuple(row[name] for name in KEY): row for row in (*rows, *new)}
     return sorted(found.values(), key=lambda row: (row["kind"] != "gpu", row["step_ms"]))
 

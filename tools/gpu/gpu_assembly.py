@@ -43,7 +43,7 @@ class Block:
     """A basic block: instructions that run one after the other, and the labels of the first.
 
     number: its place in the kernel.
-    above: numbers of its dominators, the blocks that every path to it passes, with itself.
+    above: numbers of its dominators: the blocks that every path to this block passes, and this block.
     """
 
     labels: set[str] = field(default_factory=set)
@@ -53,14 +53,14 @@ class Block:
 
     @property
     def calls(self) -> bool:
-        """True if it calls a function: the slow path of a division or a square root, whose operands or results are
-        denormal, infinite or nearly so, or whose operand is zero."""
+        """True if the block calls a function. Only slow paths of divisions and square roots do so, for numbers that are
+        denormal, infinite or nearly so, and for zero operands."""
         return any(each.name.startswith("CALL") and not each.target for each in self.body)
 
 
 @dataclass
 class Loop:
-    """A loop: its blocks without those of inner loops, the source lines of the jumps back to its head, inner loops."""
+    """A loop: its blocks without those of inner loops, source lines of the jumps back to its head, and inner loops."""
 
     blocks: list[Block]
     sources: set[int]
@@ -94,7 +94,7 @@ def kernel_of(blocks: list[Block]) -> Loop:
         return Loop([], set())
     after = _successors(blocks)
     dominators = _dominators(after)
-    reached = [block for block, found in enumerate(dominators) if 0 in found]  # not slow paths of divisions, padding
+    reached = [block for block, found in enumerate(dominators) if 0 in found]  # neither called functions nor padding
     bodies: dict[int, set[int]] = {}
     latches: dict[int, set[int]] = {}
     for block in reached:
@@ -138,7 +138,7 @@ def _predecessors(after: list[list[int]]) -> list[list[int]]:
 
 def _dominators(after: list[list[int]]) -> list[set[int]]:
     """For each block its dominators: the blocks on every path from the first block. Unreachable blocks have only
-    themselves."""
+    themselves. after: successors of each block."""
     before = _predecessors(after)
     reached, waiting = {0}, [0]
     while waiting:
@@ -159,7 +159,7 @@ def _dominators(after: list[list[int]]) -> list[set[int]]:
 
 
 def _natural(after: list[list[int]], head: int, latch: int) -> set[int]:
-    """The blocks of a loop: those that reach the latch without passing the head."""
+    """The blocks of a loop: those that reach the latch without passing the head. after: successors of each block."""
     before = _predecessors(after)
     body, waiting = {head, latch}, [latch]
     while waiting:
@@ -236,14 +236,15 @@ _GCN_SOURCE = re.compile(r"^\s+\.loc\s+\d+\s+(\d+)")
 
 def parse_sass(text: str) -> dict[str, Loop]:
     """Kernels by name, from the output of `nvdisasm -c -g -hex`: with source lines and scheduling bits."""
-    text = _SASS_WORDS.sub(r"/*\1*/", text)  # of an instruction's two words, the upper one has the bits
+    text = _SASS_WORDS.sub(r"/*\1*/", text)  # an instruction's upper word has the scheduling bits
     return _parsed(text, (_SECTION, _SASS_SOURCE, _SASS_LABEL, _SASS_LINE), _sass)
 
 
 def parse_gcn(text: str) -> dict[str, Loop]:
     """Kernels by name, from the assembly that clang writes for AMD."""
     names = re.findall(r"^\s+\.amdhsa_kernel (\w+)", text, flags=re.MULTILINE)
-    begins = re.compile(rf"^({'|'.join(names)}|\.Lfunc_end\d+):")  # no instructions follow a function's end
+    # The end of a function counts as the beginning of another one, which has no instructions.
+    begins = re.compile(rf"^({'|'.join(names)}|\.Lfunc_end\d+):")
     kernels = _parsed(text, (begins, _GCN_SOURCE, _GCN_LABEL, _GCN_LINE), _gcn)
     return {name: kernels[name] for name in names}
 
@@ -253,8 +254,12 @@ def _parsed(
     patterns: tuple[re.Pattern[str], re.Pattern[str], re.Pattern[str], re.Pattern[str]],
     instruction: Callable[[re.Match[str], int], Instruction],
 ) -> dict[str, Loop]:
-    """Functions by name. patterns: match lines that begin a function, name a source line, or are labels or
-    instructions; the first match counts."""
+    """Functions by name.
+
+    patterns: match lines that begin a function, name a source line, or are labels or instructions; the first match
+        counts.
+    instruction: makes an instruction from a match and the number of its source line.
+    """
     begins, names_source, label, line = patterns
     functions: dict[str, list[str | Instruction]] = {}
     current: list[str | Instruction] = []
@@ -272,8 +277,11 @@ def _parsed(
 
 
 def _sass(match: re.Match[str], source: int) -> Instruction:
-    """Target of a jump. BSSY is no jump: it names the place where paths meet again. CALL is a jump if its target is a
-    label of the kernel rather than a function's name."""
+    """The instruction of a line of SASS. source: its line in the kernel's text.
+
+    BSSY is no jump: it names the place where paths meet again. CALL is a jump if its target is a label of the kernel
+    rather than a function's name.
+    """
     name, rest = match["name"], match["rest"]
     family = name.partition(".")[0]
     target = re.search(r"`\((\.[\w$]+)\)", rest) if family in ("BRA", "BRX", "JMP", "CALL") else None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passes of an access through the banks of local memory.
+"""Count the passes that an access takes through the banks of local memory.
 
-A unit has 32 banks of four bytes, and in each cycle one word of each bank. Words of one bank that a wave's items access
+A unit has 32 banks, each of which delivers a word of four bytes per cycle. Words of one bank that a wave's items access
 together pass one after another; items that read the same word share it.
 """
 
@@ -55,8 +55,12 @@ ONE_WORD = r"atomic_m(ax|in)\((lasts|extremes|&longest)|RAISE_TO_GROUP_MAX"
 
 @cache
 def passes_of(words: int, address: Address, wave: int) -> int:
-    """Passes of a wave's access of this many words by each of its items. As many items as fill the banks pass together,
-    or all, if they access the same words."""
+    """Number of passes of an access by which each of a wave's items reads or writes `words` words.
+
+    As many items as fill the banks pass together, or all, if they access the same words.
+    address: an item's first word.
+    wave: number of items.
+    """
     if len({address(item) for item in range(wave)}) == 1:
         return 1
     found = 0
@@ -85,5 +89,5 @@ def passes(each: Instruction, text: str, wave: int) -> tuple[float, float]:
     address = next((address for line, address in WORDS if re.search(line, text)), _neighbours)
     if address is _neighbours:
         return least, 0
-    found = SCATTERED * least if address is None else passes_of(words, address, wave)  # fewer, if they share a word
+    found = SCATTERED * least if address is None else passes_of(words, address, wave)  # below `least` for shared words
     return found, max(found - least, 0)

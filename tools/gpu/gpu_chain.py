@@ -52,7 +52,7 @@ class Chain:
         )
 
     def times(self, rounds: float) -> Chain:
-        """The chain of this number of rounds."""
+        """This chain, repeated for this number of rounds."""
         return Chain(self.cycles * rounds, self.accesses * rounds, self.lines * rounds, self.passes * rounds)
 
 
@@ -66,11 +66,12 @@ def chain_of(
     access: int = ENDLESS,
     passes_of: Callable[[Instruction], tuple[float, float]] = lambda _: (0, 0),
 ) -> Chain:
-    """The chain of the last of some rounds of a loop.
+    """The chain of one round of a loop: of the last one, if `rounds` rounds run.
 
     blocks: blocks of the loop, each with the fraction of the rounds that run it.
     lines_of: cache lines that an instruction touches.
-    passes_of: its passes through the banks of local memory, and how many of them are conflicts.
+    access: cycles of an access to global memory. With ENDLESS, waits are counted as `accesses` instead.
+    passes_of: an instruction's passes through the banks of local memory, and how many of them are conflicts.
     """
     weighted = [(each, share, *passes_of(each)) for block, share in blocks if share for each in block.body]
     now, ready = 0, [0] * 8
@@ -91,15 +92,17 @@ def chain_of(
 
 @cache
 def _latency(name: str) -> int | None:
-    """The cycles of VARIABLE for an instruction."""
+    """The cycles of VARIABLE for an instruction of this name; None for an access to global memory."""
     return next(cycles for pattern, cycles in VARIABLE if re.match(pattern, name))
 
 
 def _issued(each: Instruction, now: int, ready: list[int], access: int, conflicts: int) -> int:
-    """The time at which the next instruction may begin.
+    """The cycle in which the next instruction may begin.
 
-    ready: when each scoreboard is clear; changed in place.
-    conflicts: cycles by which conflicts of banks delay its result.
+    now: the cycle in which this instruction may begin.
+    ready: cycles in which the scoreboards are clear; changed in place.
+    access: cycles of an access to global memory.
+    conflicts: cycles by which conflicts of banks delay the instruction's result.
     """
     control = each.control
     result, operands, waits = control >> 5 & 7, control >> 8 & 7, control >> 11 & 63

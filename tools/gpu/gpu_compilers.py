@@ -64,7 +64,7 @@ TEXTS: dict[tuple[str, str], str] = {}
 
 @dataclass(frozen=True)
 class Source:
-    """A kernel file and the options with which clsplat builds it. commit: of older code, which is in TEXTS."""
+    """A kernel file and the options with which clsplat builds it. commit: of older code, whose text is in TEXTS."""
 
     stem: str
     options: tuple[str, ...]
@@ -97,7 +97,7 @@ class Source:
 
     @property
     def common(self) -> tuple[str, ...]:
-        """The options without those of one maker's driver."""
+        """The options that every driver takes, without those of NVIDIA's."""
         return tuple(each for each in self.options if not each.startswith("-cl-nv-"))
 
     @property
@@ -124,8 +124,8 @@ class Source:
 
     @property
     def used(self) -> Source:
-        """The source without defines that its text does not use. Sources for which this is equal have the same kernels,
-        as most files do in shapes that differ only in the number of items."""
+        """The source without defines that its text does not use. Two sources with equal `used` have the same kernels,
+        such as those of most files in shapes that differ only in the number of items."""
         words = set(re.findall(r"\w+", self.text))
         names = {each: each.removeprefix("-D").partition("=")[0].partition("(")[0] for each in self.options}
         kept = (each for each in self.options if not each.startswith("-D") or names[each] in words)
@@ -181,7 +181,7 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def run_checked(command: Sequence[str], what: str) -> str:
-    """Both output streams of a command. Raises ClsplatError if the command fails."""
+    """Run a command, and return its output and errors. Raises ClsplatError if it fails. what: begins the message."""
     done = _run(command)
     if done.returncode:
         told = [line for line in done.stderr.splitlines() if "error" in line or "fatal" in line]
@@ -197,7 +197,8 @@ def target_flags(target: str) -> tuple[str, ...]:
 
 
 def build_builtins(target: str, folder: Path) -> Path:
-    """Bitcode of the built-in functions. It has no source lines, so that instructions count for the caller's line."""
+    """Compile the built-in functions to bitcode in the folder. It has no source lines, so that their instructions count
+    for the line of the caller."""
     path = folder / f"builtins-{target}.bc"
     options = (*FLAGS, *target_flags(target), "-cl-std=CL1.2", "-cl-fp32-correctly-rounded-divide-sqrt")
     run_checked([clang(), *options, "-c", "-emit-llvm", str(BUILTINS), "-o", str(path)], BUILTINS.name)
@@ -205,7 +206,10 @@ def build_builtins(target: str, folder: Path) -> Path:
 
 
 def assembled(source: Source, target: str, builtins: Path, folder: Path) -> Path:
-    """Compile a kernel file to assembly in the folder. Raises ClsplatError if clang refuses it."""
+    """Compile a kernel file to assembly in the folder. Raises ClsplatError if clang refuses it.
+
+    builtins: from `build_builtins`.
+    """
     what = f"{source.label} for {target}"
     text, assembly = (folder / f"{source.stem}.{end}" for end in ("cl", "s"))
     text.write_text(source.text, encoding="utf-8")
@@ -219,7 +223,7 @@ def assembled(source: Source, target: str, builtins: Path, folder: Path) -> Path
 
 
 def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
-    """Compile a kernel file. Raises ClsplatError if a compiler refuses it."""
+    """Compile a kernel file. Raises ClsplatError if a compiler refuses it. builtins: from `build_builtins`."""
     with tempfile.TemporaryDirectory(dir=builtins.parent) as scratch:
         assembly = assembled(source, target, builtins, Path(scratch))
         if not target.startswith("sm_"):
@@ -268,8 +272,11 @@ def read_amd(assembly: str, target: str) -> list[Built]:
 
 
 def ask_package(shape: str, frames: Sequence[Mapping[str, Any]], folder: Path = Path(__file__).parent) -> list[Any]:
-    """Launches of each frame, as recorded by `gpu_variants.py`. shape: or a variant of a trial, by its place there.
-    folder: with the script, in a copy of the code. Raises ClsplatError."""
+    """Launches of each frame, as `gpu_variants.py` records them. Raises ClsplatError.
+
+    shape: a shape, or "variant N" for a variant of a trial.
+    folder: the folder of this script, of the present code or of a copy of older code.
+    """
     script = folder / "gpu_variants.py"
     command = [sys.executable, str(script), shape, *(json.dumps(frame) for frame in frames)]
     root = str(script.parents[2])

@@ -82,8 +82,8 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
 def lists_in(lengths: np.ndarray) -> dict[str, Any]:
     """Keys of a frame's row, from the lengths of its tiles' lists.
 
-    They are the longest list, and for the lengths 1, 2, 4, ... the number of lists up to this length and over half of
-    it, and their pairs.
+    The keys are the longest list, and, for each length 1, 2, 4, ..., the number of lists of at most this length and
+    over half of it, and their pairs.
     """
     doublings = np.ceil(np.log2(np.maximum(lengths, 1))).astype(np.int64)
     return {
@@ -105,7 +105,7 @@ WALK = ("walked", "reached", "taken", "halves", "longer_reached", "longer_taken"
 
 
 def walk_of(splats: np.ndarray, stops: np.ndarray, corner: np.ndarray) -> list[int]:
-    """WALK of a tile, and VISITS for each of WARPS: of all warps, and of the warp with most blocks.
+    """The counts WALK of a tile, then for each number of warps in WARPS those of `visits_of`.
 
     splats: splats of the tile's pairs, front to back.
     stops: (16, 16), the first pair that each pixel does not take.
@@ -143,7 +143,7 @@ def _blocks(pixels: np.ndarray, over: Callable[..., np.ndarray] = np.any) -> np.
 def visits_of(
     warps: int, ellipse: np.ndarray, ends: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], last: np.ndarray
 ) -> list[int]:
-    """VISITS of a tile, and of its warp with most blocks.
+    """The counts VISITS of a tile that `warps` warps share: of all warps, then of the warp that visits most blocks.
 
     ellipse: (n, BLOCKS), blocks that the ellipse of a pair reaches.
     ends: (n, BLOCKS), blocks with a pixel that takes the pair or is finished by it.
@@ -172,7 +172,7 @@ def visits_of(
 def back_of(back: np.ndarray, takes: np.ndarray, walked: int, of_round: int) -> list[np.ndarray]:
     """Counts of the gradient's walk for each of a tile's two strips (strips.h).
 
-    They are: pairs that it visits; those that reach all blocks of the strip; for the other pairs, blocks that it
+    They are: pairs that the walk visits; those that reach all blocks of the strip; for the other pairs, blocks that it
     visits, and blocks with a pixel that takes the pair; and rounds (2, batches).
 
     back, takes: the arrays of `gradient` in `visits_of`.
@@ -190,8 +190,9 @@ def back_of(back: np.ndarray, takes: np.ndarray, walked: int, of_round: int) -> 
 def summary(walks: np.ndarray) -> dict[str, Any]:
     """Keys of a frame's row, from WALK and VISITS of its tiles (tiles, counts).
 
-    The slowest tile is the one with the most pairs and blocks in one half. Its pairs, and the counts of its longer half
-    or longest warp, are among the keys. All other counts are per walked pair. Those of VISITS are lists over WARPS.
+    The slowest tile is the one with the most pairs and blocks in one half. Its keys are its number of pairs, and the
+    counts of its longer half and its longest warp. Counts of WALK and VISITS are per walked pair; those of VISITS are
+    lists over WARPS.
     """
     walked = walks[:, 0]
     slowest = walks[walks[:, (0, 4, 5)].sum(1).argmax()]
@@ -212,8 +213,8 @@ def summary(walks: np.ndarray) -> dict[str, Any]:
 def as_measured(row: Mapping[str, Any], calibration: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The row of a frame with the numbers of the measured frame of this name, if there is one.
 
-    These are Gaussians, visible Gaussians and listed pairs. The lengths of lists are scaled by the ratio of listed
-    pairs. The key `counted` then has the number of the model's own Gaussians.
+    These numbers are Gaussians, visible Gaussians and listed pairs. The lengths of lists are scaled by the ratio of
+    listed pairs. The key `counted` then has the number of Gaussians of the model that was counted.
     """
     scenes = (scene for measured in calibration for scene in measured["scenes"])
     scene = next((each for each in scenes if each.get("frame") == row["name"] and "pairs" in each), None)

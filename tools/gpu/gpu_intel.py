@@ -77,7 +77,7 @@ def read_intel(source: Source, device: str, binary: bytes) -> list[IntelBuilt]:
 
 
 def compiled_for_intel(sources: Iterable[Source], jobs: int, say: Callable[[str], None]) -> list[IntelBuilt]:
-    """Compile every source for every device. Raises ClsplatError."""
+    """Compile every source for every device. Raises ClsplatError. say: prints progress."""
     asked = [(source, device) for device in INTEL for source in sources]
     say(f"{len(asked)} kernel files to compile for Intel")
     with ThreadPoolExecutor(jobs) as pool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cache lines that an access to memory touches, by the line of the kernel's text that makes it."""
+"""Count the cache lines that an access to memory touches, from the line of the kernel's text with the access."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpu_run import Run
 WORD = r"STG\.E$|global_store_(dword|b32)$"
 """Names of stores of four bytes."""
 APART: tuple[tuple[str, str, float | Callable[[Run], float]], ...] = (
-    (r"APPEND\(", WORD, lambda run: 4 * run.addends),  # gaussian_from_slot, one after another for each Gaussian
+    (r"APPEND\(", WORD, lambda run: 4 * run.addends),  # gaussian_from_slot, where a Gaussian's slots are neighbours
     (r"tile_keys\[pair\] = ty", "", lambda run: 4 * run.addends),
     (r"pair_ids\[pair\] = \(uint2\)\(slot, i\)", "", lambda run: 8 * run.addends),
     (r"\bf\[0\]", "", 4 * 45),

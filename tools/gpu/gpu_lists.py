@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often loops over Gaussians' tiles and over lists run, from a frame's boxes and the lengths of its lists."""
+"""Compute how often loops over Gaussians' tiles and over lists run, from a frame's boxes and lengths of lists."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ SIDE = 8
 
 @dataclass(frozen=True)
 class Boxes:
-    """Bounding boxes of Gaussians, in tiles. Of waves, all numbers are means; a wave has 32 neighbouring Gaussians. The
-    rows of a box of more than SMALL_BOX tiles are tested.
+    """Bounding boxes of Gaussians, in tiles.
+
+    The rows of a box of more than SMALL_BOX tiles are tested. A box of more than OWN_BOX tiles is wide. A wave has 32
+    neighbouring Gaussians; its numbers are means over all waves.
 
     refined: fraction of waves with a Gaussian for which `refine` runs.
-    wave_rows, wave_tested: without wide boxes, the largest number of a wave's rows, and of rows that are tested.
-    wave_tiles: without wide boxes, rounds over tiles: for each row, those of the Gaussian with the most tiles in it.
-    own_pairs: without wide boxes, a wave's pairs.
-    all_tested, all_pairs: the largest number of rows that are tested, and of pairs, of any box.
-    sorted_rows, sorted_tested, sorted_tiles: as wave_rows, wave_tested and wave_tiles, but of any box, and of waves of
-        Gaussians that are neighbours in depth.
+    wave_rows, wave_tested: largest number of rows, and of tested rows, of a box in a wave, without wide boxes.
+    wave_tiles: rounds of a wave over tiles, without wide boxes: in each row, those of the box with the most tiles.
+    own_pairs: number of a wave's pairs, without wide boxes.
+    all_tested, all_pairs: largest number of tested rows, and of pairs, of a box in a wave, with wide boxes.
+    sorted_rows, sorted_tested, sorted_tiles: as wave_rows, wave_tested and wave_tiles, but with wide boxes, and for
+        waves of Gaussians that are neighbours in depth.
     wide: number of wide boxes of a group.
     wide_rows, wide_columns: mean numbers of rows and columns of a wide box.
     """
@@ -51,26 +53,26 @@ class Boxes:
     wide_columns: float = 0
 
     def shared_rows(self, items: int) -> float:
-        """Rounds over the rows of a group's wide boxes, if its items share them."""
+        """Rounds over the rows of a group's wide boxes, whose tiles the group's items share. items: their number."""
         return self.wide * max(self.wide_rows * SIDE / items, 1)
 
     def rows_at_once(self, items: int) -> float:
-        """Rows of a wide box in such a round."""
+        """Rows of a wide box that a group of this many items processes in a round."""
         return min(self.wide_rows, items / SIDE)
 
     @property
     def columns_at_once(self) -> float:
-        """Tiles of a row of a wide box in a round."""
+        """Tiles of a wide box's row that are processed in a round."""
         return min(self.wide_columns, SIDE)
 
     @property
     def shared_columns(self) -> float:
-        """Rounds over a row of a wide box."""
+        """Rounds over the tiles of a wide box's row."""
         return max(self.wide_columns / SIDE, 1)
 
 
 def boxes_of(frame: Mapping[str, Any], items: int) -> Boxes:
-    """The boxes of a frame, for groups of `items` items."""
+    """The `Boxes` of a frame, for groups of `items` items."""
     found = {each.name: frame[each.name] for each in fields(Boxes)}
     return Boxes(**{**found, "wide": found["wide"] * items})
 
@@ -81,13 +83,14 @@ class Sorting:
 
     stages: number of stages.
     parts: number of parts in all stages.
-    blocks, steps: blocks of Batcher's network in local memory, and its steps, two at a time, in all parts.
+    blocks, steps: rounds over sizes of blocks of Batcher's network in local memory, and over its steps, two at a time.
+        Both are sums over all parts.
     far_steps: steps through global memory.
-    ordered: an item's fours of pairs that it orders in two steps, in local memory.
+    ordered: number of times that an item orders four pairs in local memory, by two steps.
     ordered_far: comparisons of an item in global memory.
-    fetched: copies of AHEAD pairs to local memory by an item.
+    fetched: number of times that an item copies AHEAD pairs to local memory.
     stored: pairs that an item copies back.
-    listed: lists of AHEAD pairs that an item writes.
+    listed: number of times that an item writes AHEAD pairs of the sorted list.
     """
 
     stages: float = 0
@@ -103,7 +106,7 @@ class Sorting:
 
 
 def sorting_of(lists: Iterable[tuple[float, float]], items: int) -> Sorting:
-    """The mean over lists. lists: numbers of lists, and their mean lengths."""
+    """The mean over lists. lists: from `lists_of`. items: number of items of a group."""
     each = [(number, _sorting(length, items)) for number, length in lists]
     whole = sum(number for number, _ in each)
     return Sorting(*(sum(number * getattr(one, of.name) for number, one in each) / whole for of in fields(Sorting)))
@@ -113,7 +116,8 @@ def _sorting(length: float, items: int) -> Sorting:
     merges = math.ceil(math.log2(max(length / LOCAL_PAIRS, 1)))
     parts = [min(length - first, LOCAL_PAIRS) for first in range(0, math.ceil(length), LOCAL_PAIRS)]
     doublings = [math.ceil(math.log2(max(part, 1))) for part in parts]
-    # Of each block of each part: the part's length, and the logarithm of half the block.
+    # An entry for each size of the blocks of Batcher's network in each part: the part's length, and log2 of half the
+    # block's length.
     blocks = [(part, block) for part, number in zip(parts, doublings, strict=True) for block in range(number)]
     blocks += [(part, LOCAL_PAIRS.bit_length() - 2) for part in parts] * merges
     steps = [(part, max(1 << (block - 2 * turn) >> 1, 1)) for part, block in blocks for turn in range(block // 2 + 1)]
@@ -134,12 +138,12 @@ def _sorting(length: float, items: int) -> Sorting:
 
 
 def _fours(length: float, apart: int) -> float:
-    """Number of fours of pairs, `apart` from each other, of which the first is in the list."""
+    """Number of groups of four pairs, `apart` places from each other, whose first pair is in a list of this length."""
     whole = length // (4 * apart)
     return whole * apart + min(length - 4 * apart * whole, apart)
 
 
 def lists_of(frame: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """A frame's lists by ranges of lengths: numbers of lists, and their mean lengths."""
+    """A frame's lists by ranges of lengths: for each range the number of lists, and their mean length."""
     lists = zip(frame["list_tiles"], frame["list_pairs"], strict=True)
     return [(tiles, pairs / tiles) for tiles, pairs in lists if tiles]

@@ -44,7 +44,7 @@ class Cost:
 
 
 def rules_of(kernel: str, commit: str = "") -> tuple[Rule, ...]:
-    """The rules of a kernel. commit: of older code. Raises UnknownLoopError."""
+    """The rules of a kernel. commit: of older code; empty for the present code. Raises UnknownLoopError."""
     if kernel in (measured := MEASURED.get(commit, {})):
         return measured[kernel] + EVERYWHERE
     if kernel not in BY_PAIR and kernel not in BY_ITEM:
@@ -53,20 +53,26 @@ def rules_of(kernel: str, commit: str = "") -> tuple[Rule, ...]:
 
 
 def _same(one: Loop, other: Loop, lines: Sequence[str]) -> bool:
-    """True if two loops of one rule are copies of the same loop: they share source lines, or their lines differ. Equal
-    lines at different places belong to different loops."""
+    """True if two loops of one rule are copies of one source loop. lines: the kernel's text.
+
+    Copies share source lines, or none of their lines have the same text. Lines of the same text at different places
+    belong to different loops.
+    """
     texts = ({lines[number - 1] for number in each.sources if number} for each in (one, other))
     return bool(one.sources & other.sources) or not set.intersection(*texts)
 
 
-def _unrolled(loop: Loop, rule: Rule, twins: Sequence[Loop]) -> float:
-    """Rounds of the source loop in one round of this loop. The rule's mark determines it, or else the number of memory
-    accesses relative to the remainder loop, a shorter copy with the same lines. Infinite for the remainder loop."""
+def _unrolled(loop: Loop, rule: Rule, copies: Sequence[Loop]) -> float:
+    """Number of rounds of the source loop in one round of a compiled loop; infinite for a remainder loop.
+
+    It follows from the rule's mark, or else from the number of memory accesses relative to the remainder loop.
+    copies: all compiled copies of the source loop. The remainder loop is a shorter one.
+    """
 
     def uses(each: Loop) -> tuple[int, int]:
         return each.counts["shared"] + each.counts["global"], each.size
 
-    longest, shortest = max(map(uses, twins)), min(map(uses, twins))
+    longest, shortest = max(map(uses, copies)), min(map(uses, copies))
     if uses(loop)[0] < longest[0] or (not longest[0] and uses(loop) < longest):
         return math.inf
     if rule.mark:
@@ -100,9 +106,9 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
                 unknown.append(_title(loop, lines))
                 continue
             used.update(matching)
-            twins = [each for each in outer.inner if matching[0].opens(each, lines) and _same(each, loop, lines)]
+            copies = [each for each in outer.inner if matching[0].opens(each, lines) and _same(each, loop, lines)]
             times = outer_rounds if matching[0].inner else 1
-            unrolled = 1 if matching[0].copies else _unrolled(loop, matching[0], twins)
+            unrolled = 1 if matching[0].copies else _unrolled(loop, matching[0], copies)
             factor = times * matching[0].rounds(run) / unrolled
             blocks = shared(loop, matching[0].text)
             for kind, count in _counts(blocks).items():
@@ -128,7 +134,7 @@ def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:
     found = {kernel: set(rules) for kernel, rules in used.items()}
     somewhere = set().union(*found.values()).intersection(EVERYWHERE)
     return [
-        f"{kernel}: no loop of it is that of the rule `{rule.text}` in tools/gpu/gpu_rules.py"
+        f"{kernel}: has no loop for the rule `{rule.text}` in tools/gpu/gpu_rules.py"
         for kernel, rules in found.items()
         for rule in rules_of(kernel)
         if rule not in rules | somewhere
@@ -146,6 +152,8 @@ def _shares(
     """The blocks of a loop, each with the fraction of rounds that run it.
 
     Slow paths of divisions and square roots never run, as few operands need them.
+    parts: rules of branches.
+    used: gets the rules that apply.
     """
     sources = [{each.source for each in block.body} for block in loop.blocks]
     held = [[rule for rule in parts if rule.holds(each, lines)] for each in sources]

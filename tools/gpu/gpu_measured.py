@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measured steps of docs/gpus/calibration.json, and the model's predictions of them.
+"""Read the measured steps of docs/gpus/calibration.json, and compare them with the model's predictions.
 
 A row of the file has a device, its driver, date and commit, and scenes. Of a scene, `frame` is its name in
 gpu_frames.json, `parts_ms` or `kernels_ms` are times on the device, and `frame_ms` and `step_ms` are wall times.
 `inputs` are the model's inputs for the step's launches, from the code that was measured. So a row stays a test of the
-model when kernels change. `gpu_static.py --inputs` counts them anew after a change to the model (`gpu_recount.py`).
+model when kernels change. After a change to the model, `gpu_static.py --inputs` counts inputs anew (`gpu_recount.py`).
 Rows without inputs, or of a device that is not in `gpu_devices.py`, are not used.
 """
 
@@ -49,7 +49,7 @@ DRAWN = ", drawn"
 
 @dataclass(frozen=True)
 class Measured:
-    """A scene of a row.
+    """A measured scene of a row of calibration.json.
 
     code: commit and date.
     ms: measured milliseconds, by part and WALLS.
@@ -75,7 +75,7 @@ class Measured:
 def milliseconds(
     works: Sequence[Work | None], gpu: Gpu, constants: Constants, drawn: Sequence[Work | None] = ()
 ) -> dict[str, float]:
-    """Milliseconds of PARTS and WALLS. drawn: the launches of a frame, if they are not among those of the step."""
+    """Predicted milliseconds of PARTS and WALLS. works: of a step. drawn: of a frame; if empty, those of the step."""
     stages = stages_of(works, gpu, constants)
     found = {
         part: sum((stages[name] for name in members if name in stages), Stage()).ms for part, members in PARTS.items()
@@ -104,7 +104,7 @@ def inputs_of(works: Iterable[Work | None]) -> list[Any]:
 
 
 def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
-    """The file's text, with inputs added to scenes that have none. works: the work of the code that was measured."""
+    """Text of calibration.json, with inputs added to scenes that have none. works: of the code that was measured."""
     inputs, rows = [], deepcopy(rows)
     for row in rows:
         target = next((each.target for each in GPUS if each.name == row.get("gpu")), "")
@@ -162,7 +162,7 @@ Fit = tuple[Sequence[Measured], Constants, Sequence[str], Works]
 
 
 def fit_constants(rows: Sequence[Mapping[str, Any]], measured: Sequence[Measured]) -> Constants:
-    """The constants that fit the measured frames of WITHIN best: least squares of the logarithms of ratios.
+    """The constants that fit the measured frames of WITHIN best: least squares of log(predicted / measured).
 
     Constants that small kernels have measured are taken from the rows.
     """

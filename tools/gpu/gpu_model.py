@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predict the milliseconds of a training step on a GPU, and fit the model's few constants to measured steps.
 
-A launch takes the time of its bytes, and after that the longest of: starting its instructions, looking up its cache
-lines, passing through the banks of local memory, its atomics, starting its groups, and the chains of its warps
-(`gpu_chain.py`), as many at a time as fit, or the chain of the slowest tile's alone. No launch takes less than LAUNCH.
-Bytes are added because an H100 and an H200, which differ in nothing but memory, differ in each stage by the time of its
-bytes. Every constant is shared by all stages.
+A launch takes the time of its bytes, plus the longest of six times: of its instructions, cache lines, passes through
+banks of local memory, atomics and groups, and of its warps' chains (`gpu_chain.py`). As many chains run at a time as
+warps fit, and the chain of the slowest tile's warp is a lower limit. No launch takes less than LAUNCH. Bytes are added
+because an H100 and an H200, which differ in nothing but memory, differ in each stage by the time of its bytes. All
+stages share every constant.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class Work:
     counters: int = 1
 
     def on(self, gpu: Gpu, constants: Constants) -> Stage:
-        """The launch's part of its stage."""
+        """The predicted milliseconds of the launch, as a part of its stage."""
         rounds = max(self.waves / gpu.units / self.resident, 1)
         waited = (
             each.cycles + each.accesses * constants.access * gpu.ghz
@@ -138,7 +138,7 @@ def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
 
 
 def longest_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
-    """The same, as if each warp had the pairs of the longest one in the slowest tile."""
+    """The numbers of `blocks_of`, as if each warp had the pairs of the longest warp in the slowest tile."""
     warps = min(max(items // 32, 1), WARPS[-1])
     longest = {name: [value * warps for value in frame[f"longest_{name}"]] for name in VISITS}
     halves = {name: BLOCKS / 4 * frame[f"longer_{name}"] for name in ("reached", "taken")}
@@ -243,7 +243,7 @@ def _work_of(
 
 
 def _part_of(launch: Mapping[str, Any]) -> float:
-    """Maximum number of a list's pairs that a group walks: those of a part, in a gradient that divides lists."""
+    """Maximum number of a list's pairs that a group walks: the pairs of a part, if blend_grad divides lists."""
     parts = [each.partition("=")[2] for each in launch["options"] if each.startswith("-DPART_PAIRS=")]
     return int(parts[0]) if parts and launch["kernel"] == "blend_grad" else math.inf
 
@@ -257,7 +257,7 @@ def stages_of(works: Iterable[Work | None], gpu: Gpu, constants: Constants) -> d
 
 
 def wall(works: Iterable[Work | None], gpu: Gpu, constants: Constants) -> float:
-    """Milliseconds until all is done. A launch begins when the host has queued it and the one before is done."""
+    """Milliseconds until all is done. A launch begins when the host has queued it and the launch before is done."""
     queued = done = 0.0
     for work in works:
         if work is None:
@@ -269,7 +269,7 @@ def wall(works: Iterable[Work | None], gpu: Gpu, constants: Constants) -> float:
 
 
 def fit(error: Callable[[Constants], float], begin: Constants) -> Constants:
-    """The constants with the least error, one after the other until none changes."""
+    """The constants with the least error. Each in turn gets its best value, until none changes."""
     best = begin
     while True:
         before = best

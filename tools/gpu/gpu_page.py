@@ -87,7 +87,7 @@ def pair_table(rows: Sequence[Any]) -> str:
 
 
 def intel_table(built: Sequence[IntelBuilt]) -> str:
-    """Table of items in step, and of stack memory, by shape and device."""
+    """Table of items that run in step, and of stack memory, by shape and device."""
     found = {(each.kernel, each.device, each.source.items): each for each in built}
     shapes = sorted({items for _, _, items in found})
     lines = [["kernel", *(f"{INTEL[device]}, 1x{items}" for device in INTEL for items in shapes)]]
@@ -106,12 +106,12 @@ def parts_of(stages: Mapping[str, Stage]) -> dict[str, Stage]:
     """Milliseconds of the parts of a step. Raises ClsplatError for a stage that belongs to no part."""
     of_part = {stage: part for part, members in PARTS.items() for stage in members}
     if strange := [name for name in stages if name not in of_part]:
-        raise ClsplatError(f"stages {', '.join(strange)}: of no part in PARTS of gpu_measured.py")
+        raise ClsplatError(f"stages {', '.join(strange)}: of no part in PARTS of gpu_measured.py, expected one each")
     return {part: sum((stages[name] for name in members if name in stages), Stage()) for part, members in PARTS.items()}
 
 
 def stage_table(predictions: Predictions, frame: str) -> str:
-    """Table of the milliseconds of each part of a step on one GPU, beside those of other programs."""
+    """Table of the milliseconds of each part of a step: on `GPU`, and on `VKSPLAT_GPU` beside VkSplat's."""
     now, other = (list(parts_of(predictions[SHAPE, gpu, frame]).items()) for gpu in (GPU, VKSPLAT_GPU))
     lines = [["part", "launches", "issue, ms", "memory, ms", "chains, ms", "predicted, ms"]]
     lines[0] += [f"{VKSPLAT_GPU}: predicted, ms", "VkSplat there, ms"]
@@ -125,7 +125,10 @@ def stage_table(predictions: Predictions, frame: str) -> str:
 
 
 def goals(predictions: Predictions, frame: str, picture: str) -> str:
-    """A sentence each about a step and a picture, and about LiteGS."""
+    """Text with the predicted times of a step and a picture beside the goals, and with LiteGS's step.
+
+    frame, picture: names of the frames that are trained and drawn.
+    """
     stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame, picture))
     whole, shown = (sum(each.values(), Stage()).ms for each in (stages, drawn))
     beside = whole - stages["blend"].ms - stages["blend_grad"].ms
@@ -170,7 +173,7 @@ def frame_table(frames: Sequence[Mapping[str, Any]]) -> str:
 
 
 def gpu_table(measured: Sequence[Measured]) -> str:
-    """Table of the devices' data."""
+    """Table of the GPUs' data, and whether the model's constants were measured on each."""
     lines = [["GPU", "code for", "units", "instructions a cycle and unit", "GHz", "GB/s", "constants"]]
     held = {each.gpu for each in measured}
     for g in GPUS:
@@ -199,7 +202,7 @@ def constant_table(constants: Constants) -> str:
 
 
 def measured_table(measured: Sequence[Measured], constants: Constants, unused: Sequence[str]) -> str:
-    """Table of what was measured and is predicted, each with their ratio, and a sentence about what is not used."""
+    """Table of measured and predicted times with their ratio, and text about the code and rows that are not used."""
     lines = [["stage", *(f"{each.gpu.name}, {each.frame}: measured, predicted, ratio" for each in measured)]]
     predicted = [each.predicted(constants) for each in measured]
     for name in (*PARTS, *WALLS):
@@ -214,7 +217,7 @@ def measured_table(measured: Sequence[Measured], constants: Constants, unused: S
 
 
 def now_table(measured: Sequence[Measured], constants: Constants) -> str:
-    """Table of the predictions of the code that was measured, and of the present kernels, with their ratio."""
+    """Table of the predictions for the code that was measured, and for the present kernels, with their ratio."""
     held = [each for each in measured if each.now]
     lines = [["stage", *(f"{each.gpu.name}, {each.frame}: then, now, ratio" for each in held)]]
     pairs = [
@@ -231,8 +234,10 @@ def now_table(measured: Sequence[Measured], constants: Constants) -> str:
 
 
 def wanted_table(measured: Sequence[Measured], constants: Constants, now: Works) -> str:
-    """Table of the steps of WANTED_STEPS: predicted of the code that was measured and of the present kernels, and how
-    far the model is from what was measured there, in the step and on average in its parts."""
+    """Table of the steps of WANTED_STEPS, predicted for the code that was measured and for the present kernels.
+
+    It also has the model's error against the measurement, in the step and on average in its parts.
+    """
     lines = [["step", "then, ms", "now, ms", "wanted, ms", "met", "error of fit: step, parts"]]
     for name, frame, most in WANTED_STEPS:
         (gpu,) = (each for each in GPUS if each.name == name)
@@ -249,8 +254,8 @@ def wanted_table(measured: Sequence[Measured], constants: Constants, now: Works)
 
 
 def fill_in(page: str, tables: Mapping[str, str], name_of_page: str = PAGE.name) -> str:
-    """The page with its tables replaced. Each is between `<!-- NAME -->` and `<!-- end -->`. Raises ClsplatError if the
-    page lacks these comments."""
+    """The page's text with its tables replaced. Each table is between `<!-- NAME -->` and `<!-- end -->`. Raises
+    ClsplatError if the page lacks these comments. name_of_page: for the message."""
     for name, text in tables.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
         if not pattern.search(page):
@@ -262,13 +267,13 @@ def fill_in(page: str, tables: Mapping[str, str], name_of_page: str = PAGE.name)
 
 
 def _between(text: str) -> Callable[[re.Match[str]], str]:
-    """Replace a table, and keep the text around it."""
+    """A function for `re.sub` that puts the text between the two comments of a match."""
     return lambda match: f"{match[1]}{text}\n{match[2]}"
 
 
 def trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], str]:
-    """The frames that are trained, the largest last, and the name of the frame that is only rendered. Frames that are
-    held out of the fit are only compared with what was measured."""
+    """The frames that are trained, the largest last, and the name of the frame that is only rendered. Frames with
+    `held_out` are not among them."""
     trained = [frame for frame in frames if not frame.get("picture") and not frame.get("held_out")]
     return trained, next(frame["name"] for frame in frames if frame.get("picture"))
 
@@ -294,7 +299,7 @@ def tables_of(
     fitted: Fit,
     intel: Sequence[IntelBuilt] = (),
 ) -> dict[str, str]:
-    """The page's tables, keyed by name. compilers: their versions. intel: empty to omit Intel's table."""
+    """The page's tables, keyed by name. fitted: from `gpu_static.counted`. intel: empty to omit Intel's table."""
     trained, picture = trained_and_picture(frames)
     names, largest = [frame["name"] for frame in trained], trained[-1]["name"]
     tables = {

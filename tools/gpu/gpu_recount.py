@@ -46,7 +46,7 @@ def older_code(commit: str, folder: Path) -> None:
 
 
 def launches_in(folder: Path, commit: str, shape: str, frames: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """Launches of each frame by the code in a folder. Its kernels' texts are added to TEXTS."""
+    """Launches of each frame by the code of a commit, which is in a folder. Adds the kernels' texts to TEXTS."""
     steps = ask_package(shape, frames, folder / "tools/gpu")
     stems = sorted({launch["stem"] for step in steps for launch in step if "stem" in launch})
     done = subprocess.run(
@@ -57,10 +57,11 @@ def launches_in(folder: Path, commit: str, shape: str, frames: Sequence[Mapping[
 
 
 def recount(rows: Sequence[dict[str, Any]], frames: Sequence[Mapping[str, Any]], count: Count) -> None:
-    """Give all scenes of calibration.json that have a frame the inputs of the code that was measured, in place.
+    """Set the `inputs` of all scenes that have a frame to those of the code that was measured.
 
     A row's code is that of `commit`, or of `counted` if the tools of its own commit record no launches. A scene's
     `counts` replace those of its frame, where the measured kernels divided tiles differently.
+    rows: of calibration.json; changed in place.
     """
     by_name = {frame["name"]: frame for frame in frames}
     for row in rows:

@@ -26,21 +26,21 @@ Rounds = Callable[[Run], float]
 
 @dataclass(frozen=True)
 class Rule:
-    """A part of a line of a kernel's text, and the total rounds of the loop that it opens, per pair or per item.
+    """A part of a line of a kernel's text, and the total rounds of the loop that the line opens, per pair or per item.
 
     ends: parts of other lines, from which some compiler jumps back to the loop's head.
     function: a part of the head of the function with the line, if several functions have such a line.
-    part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it. Of
-    several such rules the first counts.
+    part: True for a branch that contains the line; rounds is then the fraction of the loop's rounds that take the
+    branch. Of several such rules the first counts.
     alone: True for a branch that contains no other lines than this and `ends`.
-    below: True if the fraction is also that of the blocks that run only after the branch.
+    below: True if the fraction also holds for the blocks that run only after the branch.
     inside: for a branch in one loop alone, a part of the line that opens the loop; OUTSIDE for one in no loop.
-    holding, lacking: a part of a line that the loop contains, or does not, if a compiler jumps from one line to the
-    heads of two loops.
+    holding, lacking: a part of a line that the loop contains, or does not contain, if a compiler jumps from one line to
+    the heads of two loops.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
     inner: True if rounds are per round of the enclosing loop.
-    copies: True if a compiler makes copies of the loop that run so often each, none of which is a remainder.
-    near: True if it reads what the group's items have just read.
+    copies: True if a compiler makes copies of the loop that run so often each, with no remainder loop among them.
+    near: True if the loop reads what the group's items have just read.
     active: mean number of a wave's items that take part in a round, or that access different addresses; all if None.
     """
 
@@ -72,7 +72,7 @@ class Rule:
         return (all if self.alone else any)(self.matches(number, lines) for number in sources)
 
     def opens(self, loop: Loop, lines: Sequence[str]) -> bool:
-        """True if a source line of the loop's jumps matches the rule, and the loop holds and lacks what it is to."""
+        """True if a source line of the loop's jumps matches the rule, and the loop has `holding` but not `lacking`."""
         if not any(self.matches(number, lines) for number in loop.sources):
             return False
         text = "".join(lines[each.source - 1] for block in loop.blocks for each in block.body if each.source)
@@ -207,7 +207,7 @@ def group_sum(rounds: Rounds) -> Rule:
 
 
 def _abreast(run: Run, width: float) -> float:
-    """Rounds per wave over a group's rows of this width, ABREAST elements an item."""
+    """Rounds per wave over a group's rows of this width, if an item takes ABREAST elements in a round."""
     return math.ceil(DEFAULT_GROUP_ITEMS * width / ABREAST / run.wave) * run.wave / DEFAULT_GROUP_ITEMS
 
 
@@ -225,12 +225,16 @@ REFINED = Rule("const floatL size = AS_FLOATL(AS_INTL(length)", lambda run: run.
 
 
 def _tested(inside: str, share: Rounds) -> Rule:
-    """`tile_span` in a loop over rows: the fraction of its rounds in which some item tests a row of a large box."""
+    """The rule of the branch of `tile_span` that tests a row of a large box.
+
+    inside: opens the loop over rows.
+    share: the fraction of its rounds in which one of a wave's items takes the branch.
+    """
     return Rule("if (e->tangent >= d0 && e->tangent <= d1)", share, part=True, below=True, inside=inside)
 
 
 def _unnamed(inside: str, share: Rounds) -> Rule:
-    """The same, of blocks for which a compiler names the line of its first return alone."""
+    """The rule of `_tested` for blocks to which a compiler gives only the line of the first return of `tile_span`."""
     return Rule("if (e->box <= SMALL_BOX) return;", share, part=True, alone=True, inside=inside)
 
 
@@ -247,7 +251,7 @@ def _own_active(run: Run) -> float:
 
 
 def of_addends(run: Run) -> float:
-    """Items of a wave that have an addend left in a round."""
+    """Mean number of a wave's items that have an addend left in a round."""
     return run.wave * run.shown * run.addends / run.boxes.all_pairs
 
 
@@ -270,7 +274,7 @@ _OVER_TILES = (
 
 
 def _of_run(run: Run) -> float:
-    """Elements of each item in the larger of the two groups of `list_offsets`."""
+    """Elements per item in the larger of the two groups of `list_offsets`, which scan counts of tiles and sums."""
     return max(run.elements, run.lists) / run.items
 
 
@@ -378,7 +382,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
             mark=("global", 1),
         ),
     ),
-    "radix_offsets": (  # its elements are the groups of the other two
+    "radix_offsets": (  # its elements are the groups of radix_histogram
         Rule("for (uint digit = get_group_id(0) * rows; digit < end; ++digit)", lambda run: run.digits / run.groups),
         Rule(
             "for (uint first = 0; first < groups; first += ITEMS)",
@@ -393,7 +397,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("for (uint i = item; i < count; i += ITEMS) {", _of_item, near=True),
     ),
     "ranges": (),
-    "loss_ssim": (  # loops in groups of fewer items than parts
+    "loss_ssim": (  # loops only if a group has fewer items than parts
         Rule("FOR_PARTS(part, PARTS) {", _parts, function=" moments("),
         Rule("FOR_PARTS(part, PARTS) {", _parts, function=" derivatives("),
     ),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules of the kernels that docs/gpus/calibration.json measured, where they differ from the present ones.
 
-`gpu_static.py --inputs` counts those kernels by them (`gpu_recount.py`).
+`gpu_static.py --inputs` counts the measured kernels by these rules (`gpu_recount.py`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _together(run: Run) -> int:
 
 
 def _rows(columns: int, rounds: int = 1) -> Rounds:
-    """Rounds over a block of the loss, with this many columns of its neighbours."""
+    """Rounds over a block of the loss and this many columns of its neighbours, `rounds` for each of their elements."""
     return lambda run: rounds * run.shared(min(max(run.items // 16, 1), 16) * (_LOSS_COLUMNS + columns))
 
 

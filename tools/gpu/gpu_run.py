@@ -58,7 +58,7 @@ class Run:
     others_reached, others_taken: in the gradient's walk, blocks of the tile that it visits for the other pairs, and
         those with a pixel that takes the pair.
     coefficients: SH coefficients per channel.
-    groups, elements: numbers of the launch.
+    groups, elements: number of groups of the launch, and of elements that they process.
     digits: digits of a pass of the radix sort.
     lists: number of the frame's tiles.
     boxes: of the Gaussians.

@@ -26,8 +26,11 @@ SEEN = 0.8
 
 
 def fox_like(count: int, width: int, height: int) -> Subject:
-    """A scene with the lists of a small trained model: few tiles, some with many more pairs than others, of faint
-    Gaussians, so that nearly all pairs are walked. Every call returns the same scene."""
+    """A scene whose lists are like those of a small trained model. Every call returns the same scene.
+
+    It has few tiles, some with many more pairs than others. Its Gaussians are so faint that nearly all pairs are
+    walked.
+    """
     made = synthetic(count, width, height)
     rng = np.random.default_rng(1)
     camera, model = made.camera, made.gaussians

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of kernels whose instructions `gpu_static.py` counts, and which of them the launches of each frame get."""
+"""Shapes of kernels whose instructions `gpu_static.py` counts, and the choice of a shape for each frame's launches."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def on_each_gpu(works: Mapping[str, Works], frames: Sequence[Mapping[str, Any]])
 
 
 def frames_in(shape: str, frames: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
-    """The frames whose launches are counted in a shape: in SHAPE also those that only draw a frame which is trained."""
+    """The frames whose launches are counted in a shape. In SHAPE, trained frames are also counted as pictures."""
     if shape in FORMS:
         return trained_and_picture(frames)[0][-1:]
     if shape != SHAPE:

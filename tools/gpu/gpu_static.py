@@ -12,14 +12,14 @@ The kernels are those of a training step, with clsplat's defines (`gpu_variants.
 NVIDIA's and AMD's assembly. ptxas assembles NVIDIA's; pip downloads it once into the cache folder. Division and sqrt
 are rounded correctly.
 
-Instructions per (tile, Gaussian) pair are those of all waves of a group, from its loops (`gpu_rules.py`). --intel
+Instructions per (tile, Gaussian) pair are those of all waves of a group, from rules for loops (`gpu_rules.py`). --intel
 prints a table from Intel's compiler, which reports less (`gpu_intel.py`). --page writes docs/gpu-static.md, with the
 times that `gpu_model.py` predicts, and fits the model's constants to docs/gpus/calibration.json on the way. --check
 tests the ceilings below, the page's goals, and the predictions against what was measured, and compares the page with
-current kernels. The exit status is 0 if all is as expected, 2 if a compiler is missing, and 1 if a ceiling is exceeded,
-a goal is missed, a prediction is too far off, the page is out of date, a loop or rule lacks the other, or a compiler
-refuses a kernel.
---inputs counts anew the inputs in docs/gpus/calibration.json, in the code that was measured, from the repository's
+current kernels. The exit status is 0 if all is as expected, and 2 if a compiler is missing. It is 1 if a ceiling is
+exceeded, a goal is missed, a prediction is too far off or the page is out of date. It is 1 also if a loop has no rule,
+a rule has no loop, or a compiler refuses a kernel.
+--inputs counts the inputs in docs/gpus/calibration.json anew, in the code that was measured, from the repository's
 history.
 `gpu_devices.py` computes the occupancy.
 """
@@ -91,6 +91,8 @@ MOST_INSTRUCTIONS = {"gfx1100": {"project_step": 3382}, "gfx90a": {"project_step
 class Row:
     """A kernel for a target and shape.
 
+    items: number of items per group.
+    more_shared: bytes of local memory per group that the host adds.
     pair: instructions per pair, by class; None if the kernel has no pairs.
     rules: the rules of its loops.
     unknown: description of loops without a rule, or "".
@@ -145,7 +147,8 @@ _COMPILED: dict[tuple[Source, str], list[Built]] = {}
 
 
 def sources_of(launches: Iterable[Mapping[str, Any]]) -> dict[Source, dict[str, tuple[int, int]]]:
-    """The kernel files of launches, and for each kernel the items per group and the shared memory from the host."""
+    """The kernel files of launches, and for each kernel the items per group and the bytes of local memory that the host
+    adds."""
     found: dict[Source, dict[str, tuple[int, int]]] = {}
     for launch in launches:
         if "stem" in launch:
@@ -165,7 +168,12 @@ def compiled(
     say: Callable[[str], None],
     frame: Mapping[str, Any],
 ) -> list[Row]:
-    """The rows of all sources for all targets. frame: has the blocks that a pair reaches. Raises ClsplatError."""
+    """The rows of all sources for all targets. Raises ClsplatError.
+
+    sources: from `sources_of`.
+    say: prints progress.
+    frame: the frame whose counts determine the instructions per pair.
+    """
     clang()
     if any(target.startswith("sm_") for target in targets):
         nvidia("ptxas")
@@ -187,7 +195,7 @@ def compiled(
 
 
 def row_of(source: Source, built: Built, launch: tuple[int, int] | None, frame: Mapping[str, Any]) -> Row:
-    """The row of a kernel. launch: items per group and shared memory, if the kernel is launched."""
+    """The row of a kernel. launch: items per group and the host's bytes of local memory; None if it is not launched."""
     items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
     pair, rules, unknown, a_wave = None, frozenset[Rule](), "", 0.0
     if launch or built.kernel in BY_PAIR:
@@ -245,7 +253,7 @@ def broken_loop(row: Row) -> list[str]:
     """Descriptions of exceeded ceilings of Adam's loop, if the kernel has it."""
     loops = [loop for _, loop in row.built.whole.walk() if ADAM.opens(loop, row.source.lines)]
     found = []
-    for loop in sorted(loops, key=lambda each: each.size)[-1:]:  # the others are jumps that ptxas adds
+    for loop in sorted(loops, key=lambda each: each.size)[-1:]:  # smaller loops come from jumps that ptxas adds
         if loop.size > MOST_AN_ELEMENT * ABREAST:
             found.append(
                 f"{loop.size / ABREAST:g} instructions of Adam per element, expected at most {MOST_AN_ELEMENT}"
@@ -259,7 +267,7 @@ def broken_loop(row: Row) -> list[str]:
     reads = [each for _, loop in row.built.whole.walk() for block in loop.blocks for each in block.body if each.source]
     scattered = sum(each.kind == "global" and SH_READ in lines[each.source - 1] for each in reads)
     if row.built.kernel == "project_step" and scattered:
-        found.append(f"{scattered} loads of SH coefficients a row an item, expected none")
+        found.append(f"{scattered} loads of SH coefficients, each item from its row, expected none")
     return found
 
 
@@ -287,7 +295,7 @@ def broken(rows: Sequence[Row]) -> list[str]:
             found.append(row.unknown)
     stems = {row.source.stem for row in rows}
     found += [
-        f"{stem}: no kernel file of a step; NO_STACK in gpu_static.py is to follow"
+        f"{stem}: in NO_STACK of gpu_static.py, expected a kernel file of a step"
         for stem in NO_STACK
         if stem not in stems
     ]
@@ -295,7 +303,7 @@ def broken(rows: Sequence[Row]) -> list[str]:
 
 
 def loss_faults(rows: Sequence[Row]) -> list[str]:
-    """Descriptions of exceeded ceilings of the loss, with what else reads the photograph, in the shape 1x64."""
+    """Descriptions of exceeded ceilings of the loss in the shape 1x64. Kernels of target.cl are part of the loss."""
     found = []
     for target, most in MOST_A_SAMPLE.items():
         launched = [
@@ -378,7 +386,8 @@ def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     found = broken(held) + loss_faults(rows) + missed_goals(predictions, frames) + beyond(fit[0], fit[1])
     tables = tables_of(rows, predictions, frames, compilers(), fit)
     if stale := stale_tables(PAGE.read_text("utf-8"), tables):
-        found.append(f"{PAGE.name}: of older kernels in {', '.join(stale)}; python tools/gpu/gpu_static.py --page")
+        update = "python tools/gpu/gpu_static.py --page"
+        found.append(f"{PAGE.name}: {', '.join(stale)} differ from current kernels, expected the tables of `{update}`")
     print("\n".join([*table(held), "", *(found or ["every ceiling holds, and the page is today's"])]))
     return int(bool(found))
 
@@ -395,7 +404,7 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
 
 
 def make_inputs(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
-    """Count the measured steps of calibration.json in their own code, and write it."""
+    """Count the measured steps of calibration.json in the code that was measured, and write the file."""
 
     def count(step: Sequence[Mapping[str, Any]], target: str, frame: Mapping[str, Any]) -> list[Any]:
         rows = compiled(sources_of(step), (target,), jobs, note, frame)
@@ -413,7 +422,7 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
     rows: list[Row] = []
     used: dict[str, set[Rule]] = {}
     works: dict[str, Works] = {}
-    # The compilers run in processes of their own, while this one counts the shape before.
+    # Compilers run in processes of their own, while this process counts the kernels of the shape before.
     with ThreadPoolExecutor(jobs) as asking, ThreadPoolExecutor(1) as compiling:
         steps = {shape: asking.submit(ask_package, shape, frames_in(shape, frames)) for shape in SHAPES + FORMS}
         made = [compiling.submit(rows_in, shape, asked, frames, jobs) for shape, asked in steps.items()]
@@ -440,7 +449,10 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
 
 
 def rows_in(shape: str, asked: Future[list[Any]], frames: Sequence[Mapping[str, Any]], jobs: int) -> list[Row]:
-    """The rows of a shape's kernels for every target, of FORMS those in that form. asked: launches of each frame."""
+    """The rows of a shape's kernels for every target; for a shape in FORMS, only those of kernels that have this form.
+
+    asked: a future with the launches of each frame.
+    """
     sources = sources_of(launch for step in asked.result() for launch in step)
     if shape in FORMS:
         sources = {source: kernels for source, kernels in sources.items() if source.shape == shape}
@@ -448,7 +460,7 @@ def rows_in(shape: str, asked: Future[list[Any]], frames: Sequence[Mapping[str, 
 
 
 def works_in(rows: Sequence[Row], steps: Sequence[Any], frames: Sequence[Mapping[str, Any]]) -> Works:
-    """The work of each frame's launches on every target. steps: the launches."""
+    """The work of each frame's launches on every target. steps: launches of each frame."""
     works = {}
     for target in TARGETS:
         built = {(row.source, row.built.kernel): row.built for row in rows if row.built.target == target}

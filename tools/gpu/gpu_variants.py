@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-os.environ["CLSPLAT_TRUST_DRIVER"] = "1"  # nothing is launched, or the outcome does not matter
+os.environ["CLSPLAT_TRUST_DRIVER"] = "1"  # no self-test, as nothing is launched
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
@@ -103,7 +103,7 @@ class Rehearsed:
         self.launches: list[dict[str, Any]] = []
 
     def install(self) -> None:
-        """Replace the driver's classes."""
+        """Replace the methods and classes that call the driver."""
         rehearsed = self
 
         def built(device: Device, stem: str, defines: Mapping[str, object], registers: int = 0) -> _Kernels:
@@ -181,10 +181,10 @@ def _step(rehearsed: Rehearsed, whole: VariedDevice, frame: Mapping[str, Any]) -
     gaussians = Gaussians(means, quaternions, sizes, logits, sh)
     photograph = np.zeros((height, width, 3), np.uint8)
     trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
-    # By capacity, of as many pairs as there are: launches then have exactly the items with work, for bytes and times.
+    # The capacity is the frame's number of pairs, so that launches have no items without work, which would count too.
     trainer.pending.room = lambda *_: frame["listed"]  # type: ignore[method-assign]
     trainer.rasterizer.work.tight = False
-    # A rehearsal has no bounds of chunks to read, and the frames show most of their Gaussians.
+    # Without VisibleChunks, as a simulated step has no bounds of chunks. Frames show most of their Gaussians anyway.
     trainer._active = [  # noqa: SLF001
         each for each in trainer.components if each.on and not isinstance(each, VisibleChunks)
     ]

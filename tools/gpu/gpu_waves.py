@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of a frame for waves of 32 neighbouring Gaussians, whose items run in step: a wave has the rounds of the item
-with the most, and takes a branch if one of its items does."""
+"""Count a frame's work in waves of 32 neighbouring Gaussians, whose items run in step. A wave has as many rounds as the
+item with the most, and takes a branch if one of its items does."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _longest(values: NDArray[Any]) -> float:
 
 
 def refined(subject: Subject) -> NDArray[np.bool_]:
-    """Gaussians in front of the camera whose projection `refine` computes anew: project_gaussians in gaussian.h."""
+    """Mask (n,) of the Gaussians in front of the camera whose projection `refine` computes anew (gaussian.h)."""
     camera, gaussians, found = subject.camera, subject.gaussians, []
     for begin in range(0, len(gaussians), _MOST_REFINED):
         means, quaternions, log_scales = (
@@ -60,14 +60,18 @@ def refined(subject: Subject) -> NDArray[np.bool_]:
 
 
 def _cells(low: NDArray[Any], high: NDArray[Any], count: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The first tile of an extent, and the one past its last: first_cell and end_cell in tile.h."""
+    """The first tile of an extent, and the one past its last: first_cell and end_cell in tile.h.
+
+    low, high: ends of the extent in pixels.
+    count: number of the image's tiles along the axis.
+    """
     first = np.clip(np.ceil((low - _SLACK + 0.5) / TILE - 1), 0, count)
     end = np.clip(np.floor((high + _SLACK - 0.5) / TILE + 1), 0, count)
     return first, np.maximum(end, first)
 
 
 def spans(splats: NDArray[Any], listed: NDArray[Any], tiles: tuple[int, int]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Rows of each Gaussian's box, and tiles of its box; both 0 for Gaussians that are in no list.
+    """Numbers of rows and of tiles of each Gaussian's box; both 0 for Gaussians that are in no list.
 
     splats: of each Gaussian. listed: True for those in lists. tiles: number across and down.
     """
@@ -85,7 +89,7 @@ def spans(splats: NDArray[Any], listed: NDArray[Any], tiles: tuple[int, int]) ->
 
 
 def widths(splats: NDArray[Any], rows: NDArray[Any], boxes: NDArray[Any], tiles: tuple[int, int]) -> NDArray[Any]:
-    """Tiles (n, most rows) of each row of the boxes that the ellipse reaches: tile_span in tile.h.
+    """Number of tiles that a Gaussian's ellipse reaches in each row of its box, (n, most rows): tile_span in tile.h.
 
     rows, boxes: from `spans`.
     """

@@ -142,7 +142,7 @@ class Trial:
         print(f"{time.monotonic() - self.begin:5.0f} s  {text}", file=sys.stderr, flush=True)
 
     def add(self, part: str, *rows: Any) -> None:
-        """Add rows to a part."""
+        """Add rows to a part of the results, and write them."""
         self.record[part] += rows
         self.save()
 
@@ -170,7 +170,7 @@ class Trial:
 
 
 def measure_limits(trial: Trial) -> None:
-    """The device's clocks and limits."""
+    """Measure the device's limits, and note its clocks."""
     query = "name,driver_version,clocks.sm,clocks.max.sm,clocks.mem,clocks.max.mem,power.limit"
     if clocks := told(["nvidia-smi", f"--query-gpu={query}", "--format=csv"]):
         trial.record["nvidia_smi"] = clocks.splitlines()
@@ -184,7 +184,7 @@ def measure_limits(trial: Trial) -> None:
 
 
 def measure_stages(trial: Trial) -> None:
-    """Frames and steps of each scene in each shape."""
+    """Measure frames and steps of each scene in each shape."""
     for name, subject in trial.scenes.items():
         for shape in SHAPES[:1] if trial.options.dry_run else SHAPES:
             items = trial.device.shape.relabelled(shape).items
@@ -195,7 +195,7 @@ def measure_stages(trial: Trial) -> None:
 
 
 def plain_times(subject: Subject, device: Device, repeat: int) -> dict[str, float]:
-    """Milliseconds of a frame, of a step, and of each of `repeat` steps that are not waited for one by one."""
+    """Milliseconds of a frame, of a step, and of a step among `repeat` steps without waits between them."""
     trainer = trainer_of(subject, device, RasterizerConfig())
 
     def draw() -> None:
@@ -235,7 +235,7 @@ def _measure_stages(trial: Trial, name: str, subject: Subject, shape: str) -> No
 
 
 def measure_variants(trial: Trial) -> None:
-    """Variants of the kernels, scene by scene; the usual form comes first."""
+    """Measure variants of the kernels, scene by scene, and the usual form first."""
     device = VariedDevice(trial.device.cl_device, trial.device.shape.relabelled(USUAL_SHAPE))
     for name, subject in trial.scenes.items():
         held: list[TrialScene] = []
@@ -261,7 +261,7 @@ def _measure_variant(
 
 
 def count_hardware(trial: Trial) -> None:
-    """Hardware counters of kernels, if Nsight Compute and the kernels for CUDA are available."""
+    """Read hardware counters of kernels, if Nsight Compute and the kernels for CUDA are available."""
     ncu, twins = shutil.which("ncu"), trial.options.twins
     if why := trial_peers.no_cuda() or ("" if ncu else "ncu is not there"):
         trial.leave_out("hardware counters", why)
@@ -279,7 +279,7 @@ def _count_hardware(trial: Trial, twins: Path) -> None:
 
 
 def measure_peers(trial: Trial) -> None:
-    """Other programs on the same Gaussians."""
+    """Time other programs on the same Gaussians."""
     if why := trial_peers.no_cuda():
         trial.leave_out(" and ".join(trial_peers.TIMED), why)
         return

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read hardware counters of a step's kernels with NVIDIA's Nsight Compute (ncu), for trial.py.
 
-    trial_counters.py TWINS DUMPS      launches the kernels in a process that ncu observes
+    trial_counters.py COPIES DUMPS      launches the kernels in a process that ncu observes
 
-ncu does not support OpenCL. So a kernel's twin runs in CUDA, with the arguments of a launch of the step: PTX that clang
-compiles from the same text (`write_twins`, run beforehand on a machine with clang). That is the code in which
-`gpu_static.py` counts instructions, not the code of NVIDIA's OpenCL compiler. This tool needs CuPy, and has not run on
-a GPU yet.
+ncu does not support OpenCL. So a CUDA copy of each kernel runs, with the arguments of a launch of the step. The copy is
+PTX that clang compiles from the same text (`write_twins`, run beforehand on a machine with clang). `gpu_static.py`
+counts instructions in this code too. It differs from the code of NVIDIA's OpenCL compiler. This tool needs CuPy, and
+has not run on a GPU yet.
 """
 
 from __future__ import annotations
@@ -41,10 +41,13 @@ METRICS = {
 
 
 def measure(subject: Any, device: Any, twins: Path, seconds: float) -> list[dict[str, Any]]:
-    """Counters of each kernel that has a twin. Raises OSError and CalledProcessError."""
+    """Counters of each kernel that has a CUDA copy in the folder `twins`. Raises OSError, RuntimeError, TimeoutExpired.
+
+    seconds: time limit.
+    """
     there = [kernel for kernel in TWINS if (twins / f"{kernel}.ptx").is_file()]
     if not there:
-        raise FileNotFoundError(f"{twins}: has none of {', '.join(TWINS)}, each as .ptx")
+        raise FileNotFoundError(f"{twins}: has no kernel, expected a .ptx file of {' or '.join(TWINS)}")
     with tempfile.TemporaryDirectory(prefix="clsplat-trial-") as folder:
         dump(subject, device, there, Path(folder))
         ncu = ["ncu", "--csv", "--page", "raw", "--clock-control", "none", "--metrics", ",".join(METRICS)]
@@ -84,7 +87,8 @@ def dump(subject: Any, device: Any, kernels: Sequence[str], folder: Path) -> Non
     device.enqueue = first  # before there is a trainer, as it makes copies of the device
     try:
         trainer = TrialScene(subject, device).trainer
-        trainer.train_step()  # counts its pairs; the twins are of steps by capacity, whose kernels have other arguments
+        # This step counts its pairs. The CUDA copies are of steps by capacity, whose kernels have other arguments.
+        trainer.train_step()
         dumped.clear()
         trainer.train_step()
     finally:
@@ -104,7 +108,7 @@ def counters_of(text: str) -> list[dict[str, Any]]:
 
 
 def write_twins(folder: Path, target: str) -> list[str]:
-    """Write the PTX of the kernels of the usual step. Returns their names. Raises ClsplatError."""
+    """Write CUDA copies, as PTX, of the kernels TWINS of the usual step. Returns their names. Raises ClsplatError."""
     from gpu_compilers import ask_package, assembled, build_builtins
     from gpu_static import FRAMES, sources_of
 
@@ -132,7 +136,7 @@ def arguments_of(path: Path) -> tuple[Mapping[str, Any], Iterator[np.ndarray]]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Launch each twin once."""
+    """Launch each CUDA copy once."""
     import cupy
 
     twins, dumps = map(Path, arguments)

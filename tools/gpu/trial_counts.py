@@ -23,8 +23,8 @@ from clsplat.files.atomic import atomic_write
 
 @contextmanager
 def _text_of(variant: Variant) -> Iterator[None]:
-    """Let compilers use the variant's kernel text within the block. Clears the cache of compiled kernels before and
-    after it."""
+    """A context manager, inside which compilers use the variant's kernel text. If it differs from the usual text, the
+    cache of compiled kernels is cleared before and after."""
     if not variant.text:
         yield
         return
@@ -53,9 +53,9 @@ def gpu_in(record: Mapping[str, Any]) -> Gpu:
 
 
 def count_variants(record: dict[str, Any]) -> None:
-    """Add `counted`, million instructions of warps, and `predicted_ms` to the rows of a trial's variants.
+    """Add `counted`, millions of warp instructions, and `predicted_ms` to the rows of a trial's variants.
 
-    The constants are those of the rows of calibration.json so far, without this trial. Raises ClsplatError."""
+    The model's constants are fitted to calibration.json as it is, without this trial. Raises ClsplatError."""
     gpu, calibration = gpu_in(record), json.loads(CALIBRATION.read_text("utf-8"))
     constants = fit_constants(calibration, read(calibration, {})[0])
     frames = _frames(dict.fromkeys(row["scene"] for row in record["variants"]))
@@ -66,7 +66,7 @@ def count_variants(record: dict[str, Any]) -> None:
             continue
         try:
             works_of_frames = works_of_variant(variant, gpu.target, frames)
-        except UnknownLoopError as error:  # the rules of blend_grad with a Gaussian per item are per pair
+        except UnknownLoopError as error:  # `works_of` has no rules for blend_grad with a Gaussian per item
             gpu_static.note(f"{variant.title}: not predicted: {error}")
             continue
         found = {frame["name"]: works for frame, works in zip(frames, works_of_frames, strict=True)}
@@ -92,8 +92,8 @@ def _frames(names: Iterator[str] | Mapping[str, Any]) -> list[Mapping[str, Any]]
 def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
     """The trial's row of calibration.json, without the model's inputs.
 
-    Times of kernels are those of the usual form among the variants, which are all of a step: the stages of `bench` mix
-    a frame's lists with a step's.
+    Times of kernels are those of the usual form among the variants, which are all times of a step. The stages of
+    `bench` are not used, as they mix a frame's lists with a step's.
     """
     left_out = ("shape", "host_ms", "frame_ms")  # a frame has other launches than the step of the inputs
     usual = [each for each in record["variants"] if each["variant"] == USUAL_SHAPE]
@@ -109,8 +109,8 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def add_row(record: Mapping[str, Any]) -> None:
-    """Add a trial's row to calibration.json, with the inputs of the present kernels; or replace that of this device,
-    date and commit."""
+    """Add a trial's row to calibration.json, with the inputs of the present kernels. It replaces a row of the same
+    device, date and commit."""
     row, target = row_of(record), gpu_in(record).target
     frames = _frames({scene["frame"]: None for scene in row["scenes"]})
     usual = VARIANTS[0]

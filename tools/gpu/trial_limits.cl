@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Kernels that measure one limit of a device each, for trial_limits.py.
 
-// to (n) = from (n), WIDE float4s an item, a group's accesses side by side.
+// to (n) = from (n), with WIDE float4s per item. In each access, the items of a group have neighbouring float4s.
 __kernel void copy(__global const float4 *from, __global float4 *to) {
   const size_t first = get_group_id(0) * get_local_size(0) * WIDE + get_local_id(0);
   float4 held[WIDE];
@@ -9,17 +9,17 @@ __kernel void copy(__global const float4 *from, __global float4 *to) {
   for (int k = 0; k < WIDE; ++k) to[first + k * get_local_size(0)] = held[k];
 }
 
-// The same by single floats.
+// to (n) = from (n), with one float per item.
 __kernel void copy_floats(__global const float *from, __global float *to) {
   to[get_global_id(0)] = from[get_global_id(0)];
 }
 
-// Nothing: starting groups and launches.
+// Does nothing, so that only starting groups and launches takes time.
 __kernel void nothing(__global uint *sums) {
   if (get_global_size(0) == 0) sums[0] = 1;
 }
 
-// Loads that wait for each other: next (n) is one cycle over all its elements.
+// Loads that wait for each other: next (n) leads through all its elements in one cycle.
 __kernel void chase(const uint steps, __global const uint *next, __global uint *sums) {
   uint at = 0;
   for (uint i = 0; i < steps; ++i) at = next[at];
@@ -46,20 +46,21 @@ __kernel void local_atomics(const uint steps, __global uint *sums) {
   if (get_local_id(0) == 0) sums[get_group_id(0)] = counters[0];
 }
 
-// Atomic increments of `many` counters in global memory, an item each.
+// Atomic increments of `many` counters in global memory, one increment per item.
 __kernel void global_atomics(const uint many, __global uint *counters) {
   const uint i = get_global_id(0);
   atomic_inc(counters + (i * 2654435761u >> 8) % many);
 }
 
-// Multiply-adds of eight independent sums.
+// Fused multiply-adds on eight independent sums per item.
 __kernel void multiply_adds(const uint steps, __global float *sums) {
   float8 sum = (float8)(0, 1, 2, 3, 4, 5, 6, 7) + (float)get_local_id(0);
   for (uint i = 0; i < steps; ++i) sum = fma(sum, (float8)(0.999f), (float8)(0.5f));
   sums[get_global_id(0)] = sum.s0 + sum.s1 + sum.s2 + sum.s3 + sum.s4 + sum.s5 + sum.s6 + sum.s7;
 }
 
-// native_recip of every float in [1, 2), corrected by two of Newton's steps: how many differ from the rounded quotient.
+// native_recip of each float in [1, 2) -> counters (3): number of wrong results, largest error, number of results that
+// are wrong after two steps of Newton's method.
 __kernel void reciprocals(__global uint *counters) {
   const float x = as_float(0x3f800000u + (uint)get_global_id(0));
   const float start = native_recip(x);

@@ -76,7 +76,10 @@ class Limits:
         return cl.Program(self.context, SOURCE.read_text("utf-8")).build(options=[f"-DWIDE={wide}", *exact])
 
     def kernel(self, name: str, *arguments: Any, wide: int = 1) -> cl.Kernel:
-        """A kernel with its arguments. They are kept until `free`, because a kernel does not keep its buffers alive."""
+        """A kernel with its arguments, which are kept until `free`, because a kernel does not keep its buffers alive.
+
+        wide: the define WIDE of the kernel `copy`.
+        """
         kernel = cl.Kernel(self._program(wide), name)
         kernel.set_args(*arguments)
         self._kept += arguments
@@ -146,7 +149,7 @@ def groups(on: Limits) -> dict[str, float]:
 
 def loader() -> ctypes.CDLL:
     """OpenCL's loader, by way of pyopencl's library, for calls without an event."""
-    return ctypes.CDLL(importlib.import_module("pyopencl._cl").__file__)  # also has the symbols of its dependencies
+    return ctypes.CDLL(importlib.import_module("pyopencl._cl").__file__)  # finds symbols of its dependencies too
 
 
 def launches(on: Limits) -> dict[str, float]:
@@ -159,7 +162,7 @@ def launches(on: Limits) -> dict[str, float]:
         pointers = (ctypes.c_void_p(plain.int_ptr), ctypes.c_void_p(kernel.int_ptr))
         status = enqueue(*pointers, 1, None, size, size, 0, None, None)
         if status:
-            raise cl.RuntimeError(f"clEnqueueNDRangeKernel: {status}")
+            raise cl.RuntimeError(f"clEnqueueNDRangeKernel: returned status {status}, expected 0")
 
     ways: Mapping[str, tuple[cl.CommandQueue, Callable[[], object]]] = {
         "profiled": (on.queue, lambda: cl.enqueue_nd_range_kernel(on.queue, kernel, (64,), (64,))),
@@ -201,7 +204,8 @@ def barriers(on: Limits) -> dict[str, float]:
 
 
 def atomics(on: Limits) -> dict[str, float]:
-    """Times of atomic increments: nanoseconds of a group's in local memory, milliseconds of all in global memory."""
+    """Times of atomic increments: nanoseconds of a round of a group's items in local memory, milliseconds of all
+    increments in global memory."""
     steps, counted = on.sizes.steps, on.sizes.counted // 64 * 64
     kernel = on.kernel("local_atomics", np.uint32(steps), on.buffer(4))
     found = {"local atomic ns a round of 64": on.ns(kernel, 64, 64) / steps}
@@ -222,7 +226,7 @@ def reciprocals(on: Limits) -> dict[str, float]:
     """Accuracy of native_recip over all mantissas.
 
     Returns the number of wrong results, the largest error in ulp, and the number of results that are still wrong after
-    two of Newton's steps.
+    two steps of Newton's method.
     """
     counters = on.buffer(12)
     kernel = on.kernel("reciprocals", counters)

@@ -54,7 +54,11 @@ def no_cuda() -> str:
 
 
 class Builds:
-    """Builds of peers' sources in the background. folder: contains a folder of sources for each peer."""
+    """Builds of peers' sources in the background.
+
+    folder: contains a folder of sources for each peer; None builds nothing.
+    into: folder for the built packages.
+    """
 
     def __init__(self, folder: Path | None, into: Path) -> None:
         self.into, self.failed = into, dict[str, str]()
@@ -99,7 +103,12 @@ def save(subject: Any, photograph: np.ndarray, path: Path) -> None:
 
 
 def measure(peer: str, subject: Path, repeat: int, path: Path, seconds: float) -> dict[str, Any] | str:
-    """Times of a peer on a subject, in a child process, or the reason why there are none. path: built packages."""
+    """Times of a peer on a subject, in a child process, or the reason why there are none.
+
+    subject: file that `save` has written.
+    path: folder with the built packages.
+    seconds: time limit.
+    """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(path), os.environ.get("PYTHONPATH"))))}
     command = [sys.executable, str(Path(__file__)), peer, str(subject), str(repeat)]
     try:
@@ -113,7 +122,7 @@ def measure(peer: str, subject: Path, repeat: int, path: Path, seconds: float) -
 
 
 def steps_of(peer: str, data: Mapping[str, np.ndarray], torch: Any) -> tuple[Step, Step, str]:
-    """Functions for a peer's frame and training step, and a description of its loss."""
+    """Functions for a peer's frame and training step, and a description of its loss. torch: the module."""
     there = {name: torch.tensor(data[name], dtype=torch.float32, device=DEVICE) for name in data}
     photograph = there["photograph"].permute(2, 0, 1)[None].contiguous()
     try:

@@ -49,7 +49,7 @@ class Variant:
     of: the kernels or stages on which it is measured; empty for all.
     shape: shape of all kernels.
     registers: limit of registers per work-item, by kernel file; 0 for none.
-    text: a change of a kernel file's text, WORDS => WORDS as in CLSPLAT_BREAK_KERNEL; at most one.
+    text: a change of the text, by kernel file: WORDS => WORDS as in CLSPLAT_BREAK_KERNEL; at most one.
     values: values of the package's constants, by MODULE.NAME.
     """
 
@@ -62,11 +62,12 @@ class Variant:
 
     @property
     def title(self) -> str:
-        """The name with what it is measured on."""
+        """The name, with the kernels or stages on which the variant is measured."""
         return f"{' and '.join(self.of)}, {self.name}" if self.of else self.name
 
     def changed_text(self) -> AbstractContextManager[object]:
-        """Within the block, kernels are built from the variant's text."""
+        """A context manager, inside which kernel files are built with the variant's change of text, or unchanged if it
+        has none."""
         assert len(self.text) <= 1, "CLSPLAT_BREAK_KERNEL changes one file"
         texts = {BREAK_KERNEL_VARIABLE: f"{stem}: {words}" for stem, words in self.text.items()}  # noqa: B035  # one
         return patch.dict(os.environ, texts)
@@ -93,7 +94,7 @@ _SORT_CHUNK = "clsplat.stages.scan.CHUNK_ELEMENTS_PER_ITEM"
 
 
 def _rows_of_loss(rows: int) -> Variant:
-    """The loss in blocks of so many rows."""
+    """The variant of the loss in blocks of this many rows."""
     text = {"loss": f"#define LOSS_GROUP_ROWS {LOSS_GROUP_ROWS} => #define LOSS_GROUP_ROWS {rows}"}
     values = {"clsplat.stages.loss.LOSS_GROUP_ROWS": rows}
     return Variant(f"blocks of {rows} rows", ("loss",), text=text, values=values)
@@ -155,7 +156,7 @@ class VariedDevice(Device):
 
     @contextmanager
     def varied(self, variant: Variant) -> Iterator[None]:
-        """Within the block, the device builds and launches the variant."""
+        """A context manager, inside which the device builds and launches the kernels of the variant."""
         before, shape = dict(self._now), self.shape.relabelled(variant.shape)
         with ExitStack() as changes:
             changes.enter_context(variant.changed_text())
@@ -183,7 +184,7 @@ class TrialScene:
 
     def __init__(self, subject: Subject, device: VariedDevice) -> None:
         self.subject, self.device = subject, device
-        with patch.dict(os.environ, {TAPES_VARIABLE: "0"}):  # a variant is launched, not an earlier one replayed
+        with patch.dict(os.environ, {TAPES_VARIABLE: "0"}):  # no replay of an earlier variant's launches
             self.trainer = trainer_of(subject, device, RasterizerConfig())
         count, coefficients = len(subject.gaussians), subject.gaussians.sh.shape[1]
         self._gradients = allocate_gaussians(device, count, coefficients, zero=True)

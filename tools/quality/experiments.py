@@ -75,9 +75,9 @@ def masks(given: Namespace) -> Rows:
     """Photographs with a moving block, with and without masks, and a cut-out object on a turntable.
 
     A block of patterned pixels covers a twelfth of each training photograph of a COLMAP scene, in another place each
-    time, and masks cover the block. The status is 1 if a model trained with masks depends on the block's pixels. The
-    held-out photographs have no block. The turntable is the demo's still life without floor and wall: photographs with
-    alpha, trained over black. The column alpha is the render's alpha where held-out photographs are transparent.
+    time, and masks cover the block. The exit status is 1 if a model trained with masks depends on the block's pixels.
+    The held-out photographs have no block. The turntable is the demo's still life without floor and wall: photographs
+    with alpha, trained over black. The column alpha is the render's alpha where held-out photographs are transparent.
     block.png and turntable.png show photographs and renders side by side.
     """
     path, renderer = given.scenes[0].resolve(), Renderer(open_device())
@@ -123,7 +123,7 @@ def exposure(given: Namespace) -> Rows:
     """Photographs with changing exposure against the original photographs, with and without --appearance.
 
     The photographs are written at the training resolution as float EXR, once unchanged and once multiplied by 2^U(-1,
-    1), so that nothing clips. --mixes also mixes their channels, by up to this fraction, and --corners adds a lens that
+    1), so that nothing clips. --mixes also mixes their channels, by up to its fraction, and --corners adds a lens that
     transmits 2^-CORNERS of the light in the corners. All models are compared with the unchanged held-out photographs,
     directly and after the affine map of colours that fits best. The table has the largest and mean error of the learnt
     gains up to a common factor. A second pair of errors is relative to the gains learnt from the unchanged photographs,
@@ -164,7 +164,10 @@ def _gains(photographs: Mapping[str, Mapping[str, list[float]]]) -> dict[str, li
 
 
 def gain_errors(learnt: Mapping[str, list[float]], wanted: Mapping[str, list[float]]) -> str:
-    """Largest and mean relative error of the learnt gains, up to a common factor. Arguments are logs."""
+    """Largest and mean relative error of the learnt gains, up to a common factor.
+
+    learnt, wanted: base-2 logarithms of gains, keyed by photograph.
+    """
     apart = np.array([np.subtract(learnt[name], wanted[name]) for name in learnt])
     wrong = np.abs(2.0 ** (apart - apart.mean(axis=0)) - 1)
     return f"{wrong.max():.1%} / {wrong.mean():.1%}"
@@ -175,7 +178,9 @@ def colour_errors(
 ) -> tuple[str, ...]:
     """Table cells with the errors of the mixes and of the light in the corners.
 
-    own: the appearance learnt from the unchanged photographs, or nothing.
+    learnt, own: the appearance learnt from the photographs, and from the unchanged photographs; `own` may be empty.
+    mixes, corners: the changes of photographs.
+    put: True if the photographs were changed.
     """
     apart = np.array([np.subtract(logs["mixes"], mixes[name] * put) for name, logs in learnt.items()])
     if own:
@@ -330,7 +335,7 @@ def pose_psnr(trainer: Trainer, config: TrainConfig, scene: Scene) -> tuple[floa
 
 
 def pose_errors(learnt: list[Camera], true: list[Camera]) -> tuple[float, float]:
-    """Mean error of the disturbed poses, in degrees and world units. Two poses are not disturbed."""
+    """Mean error of the disturbed poses, in degrees and world units. Two of the poses stay fixed and do not count."""
     cosines = [(np.trace(a.rotation @ b.rotation.T) - 1) / 2 for a, b in zip(learnt, true, strict=True)]
     shifts = [np.linalg.norm(a.position - b.position) for a, b in zip(learnt, true, strict=True)]
     count = len(true) - 2
@@ -370,7 +375,7 @@ def seeds(given: Namespace) -> Rows:
 def units(given: Namespace) -> Rows:
     """A scene in various units, or moved: each is trained in the same way, written, read back and rendered.
 
-    The status is 1 if PSNR differs by more than --bound from that in the scene's own units.
+    The exit status is 1 if PSNR differs by more than --bound from that in the scene's own units.
     """
     scene, renderer = load_scene(given.scenes[0], resolution=given.resolution), Renderer(open_device())
     yield "times", "moved by", "extent", "near plane", "Gaussians", "PSNR, dB", "beside its own units"

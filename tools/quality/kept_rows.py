@@ -28,8 +28,13 @@ COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished training. settings: arguments other than steps, resolution and seed. code: `code_digest`. seconds:
-    time on that device, whatever its other load. sizes: PSNR for each size of the pictures."""
+    """A finished training.
+
+    settings: arguments other than steps, resolution and seed.
+    code: `code_digest`.
+    seconds: time on the device, whatever its other load.
+    sizes: PSNR for each size at which pictures were also measured.
+    """
 
     table: str
     row: str
@@ -64,13 +69,13 @@ class Same:
 
 @dataclass(frozen=True)
 class Kept:
-    """The file: {"same": [...], "rows": [...]}. Each entry is a line, and lines are sorted, so that additions from two
-    machines can be merged."""
+    """The file of finished trainings: {"same": [...], "rows": [...]}. Each entry is a line, and lines are sorted, so
+    that additions from two machines can be merged."""
 
     path: Path
 
     def find(self, wanted: Finished) -> Finished | None:
-        """The finished training with this key, or with a code that is stated to be the same; else None."""
+        """The finished training with the key of `wanted`, or with a code that is stated to be the same; else None."""
         rows, same = self._read()
         codes = {wanted.code}
         for _ in same:  # follows chains of statements
@@ -79,7 +84,7 @@ class Kept:
         return min(found, key=lambda row: (row.code != wanted.code, row.date)) if found else None
 
     def has(self, code: str, *, mcmc: bool) -> bool:
-        """True if there is a row with this code, of growth mcmc or of other growths."""
+        """True if there is a row with this code. mcmc: True for rows of growth mcmc, False for those of others."""
         return any(row.code == code and ("mcmc" in row.settings) == mcmc for row in self._read()[0])
 
     def add(self, row: Finished) -> None:
@@ -114,8 +119,11 @@ class Kept:
 
 @cache
 def code_digest(root: Path, *, mcmc: bool) -> str:
-    """Digest of the code in the folders CODE, without comments, docstrings and empty lines. Equal digests give the same
-    bytes on one device. Different digests may give the same bytes too."""
+    """Digest of the code in the folders CODE, without comments, docstrings and empty lines.
+
+    On one device, code of equal digests trains models of the same bytes. Code of other digests may do so too.
+    mcmc: False to leave out ONLY_MCMC.
+    """
     digest = hashlib.blake2b(digest_size=8)
     for folder in CODE:
         for path in sorted((root / folder).rglob("*")):

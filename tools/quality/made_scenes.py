@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes of the experiments: the demo's, an RGB-D sequence, captures by the ray caster, disturbances of a scene."""
+"""Make the experiments' scenes: the demo's, an RGB-D sequence, captures by the ray caster, disturbed scenes."""
 
 from __future__ import annotations
 
@@ -65,14 +65,15 @@ def baked(seed: int) -> list[Surface]:
 
 
 def nearest(surfaces: list[Surface], camera: Camera, rays: NDArray[Any]) -> tuple[Float32, NDArray[Any], Float32]:
-    """Distances (N,) along unit rays (N, 3) of the camera, the surface that each ray hits, and world directions."""
+    """Distances (N,) along unit rays (N, 3) of the camera, indices (N,) of the surfaces that they hit, and the rays'
+    directions (N, 3) in the world."""
     directions = (rays @ camera.rotation).astype(np.float32)
     distances = np.stack([surface.distance(camera.position.astype(np.float32), directions) for surface in surfaces])
     return distances.min(axis=0), distances.argmin(axis=0), directions
 
 
 def depth_of(surfaces: list[Surface], camera: Camera) -> Float32:
-    """The depth (H, W) along the axis that each pixel's centre shows, 0 where there is none."""
+    """Depths (H, W) along the camera's axis at the pixels' centres, 0 where no surface is hit."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2).reshape(-1, 3)
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
@@ -82,7 +83,7 @@ def depth_of(surfaces: list[Surface], camera: Camera) -> Float32:
 
 
 def demo(width: int, photos: int, seed: int) -> Capture:
-    """The demo's scene."""
+    """A capture of the demo's scene. width: of the photographs, in pixels. photos: their number."""
     surfaces, views = baked(seed), cameras(photos, width, width * 3 // 4, seed)
     with ThreadPoolExecutor(2) as pool:
         pictures = [np.asarray(picture, np.float32) for picture in pool.map(partial(render, surfaces), views)]
@@ -90,9 +91,11 @@ def demo(width: int, photos: int, seed: int) -> Capture:
 
 
 def rgbd(folder: Path, width: int, photos: int) -> Capture:
-    """An RGB-D sequence of frame-N.color.jpg, .depth.png (16 bit, mm) and .pose.txt, beside camera-intrinsics.txt.
+    """The capture of an RGB-D sequence: frame-N.color.jpg, .depth.png (16 bit, mm), .pose.txt, camera-intrinsics.txt.
 
     A pixel has the depth of the map's nearest pixel.
+    width: of the photographs, in pixels.
+    photos: maximum number of photographs.
     """
     matrix = np.loadtxt(folder / "camera-intrinsics.txt")
     files = sorted(folder.glob("frame-*.color.jpg"))
@@ -125,7 +128,7 @@ def cut_out(surfaces: list[Surface], camera: Camera) -> Float32:
 
 
 def turntable(photos: int, seed: int) -> Capture:
-    """A scene of the still life's objects, cut out of their surroundings."""
+    """A capture of the still life's objects, cut out of their surroundings."""
     things = [surface for surface in baked(seed) if not isinstance(surface, Floor | Wall)]
     views = cameras(photos, 160, 120, seed)
     with ThreadPoolExecutor(2) as pool:
@@ -134,8 +137,10 @@ def turntable(photos: int, seed: int) -> Capture:
 
 
 def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], seed: int) -> Path:
-    """Write nerfstudio's transforms.json, which names sparse.ply, and dense.ply. The points are drawn at random from
-    the depths."""
+    """Write a capture as nerfstudio's transforms.json, which names sparse.ply, and write dense.ply beside it.
+
+    counts: numbers of sparse and dense points, which are drawn at random from the depths.
+    """
     for name in ("images", "depths"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     frames: list[dict[str, Any]] = []
@@ -164,7 +169,8 @@ def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], se
 
 
 def fisheye_of(pinhole: Camera, side: int) -> Camera:
-    """The fisheye at a pinhole camera's pose. Its circle of 190 degrees is as wide as its square picture."""
+    """The fisheye at a pinhole camera's pose. Its picture is a square of this side, as wide as its circle of 190
+    degrees."""
     theta = ANGLE / 2
     reach = theta * (1 + sum(k * theta ** (2 * power) for power, k in enumerate(RADIAL, 1)))
     focal, middle = side / 2 / reach, side / 2
@@ -270,7 +276,10 @@ def without_colours(scene: Path, folder: Path) -> Path:
 
 
 def remodelled(scene: Path, folder: Path, change: Callable[[Any], None]) -> Path:
-    """Write a COLMAP scene with a changed model, unless it is there. Its photographs are linked."""
+    """Write a COLMAP scene with a changed model, unless `folder` exists. Its photographs are linked.
+
+    change: changes the model in place.
+    """
     if not folder.exists():
         model = pycolmap.Reconstruction(scene / "sparse" / "0")
         change(model)
@@ -300,7 +309,7 @@ def in_units(scene: Scene, factor: float, offset: Float64) -> Scene:
 
 
 def rescaled(folder: Path, factor: float) -> Path:
-    """The folder of a COLMAP scene whose world is scaled by factor. Its photographs are linked."""
+    """Write a COLMAP scene whose world is scaled by factor, and return its folder. Its photographs are linked."""
     larger = pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3))
     return remodelled(
         folder, folder.with_name(f"{folder.name}-times-{factor:g}"), lambda model: model.transform(larger)
@@ -356,7 +365,8 @@ def own_block_mask(config: TownConfig, shot: TownPhotograph) -> NDArray[np.bool_
 
 
 def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
-    """The scene with its training poses, except the two fixed ones, turned and shifted by percent of the extent."""
+    """The scene with its training poses, except the two fixed ones, turned by `degrees` and shifted by `percent` of the
+    extent."""
     rng = np.random.default_rng(seed)
     train = [view.name for view in scene.train_views]
     held = {train[index] for index in Poses(TrainConfig(refine_poses=True), scene.train_views, scene.extent).held}

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The experiments of docs/quality.md, by name.
+"""Run the experiments of docs/quality.md, by name.
 
     .venv/bin/python tools/quality/run.py NAME FOLDER [SCENE...] [--iterations N] [--seed N] [--help]
     .venv/bin/python tools/quality/run.py tables SCENES -o FOLDER [--help]
@@ -47,7 +47,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
 
 
 def show(rows: Rows) -> int:
-    """Print rows as they come, with a line below each head. Returns the experiment's status."""
+    """Print rows as they come, with a line below the first row of each table. Returns the experiment's status."""
     before = ""
     while True:
         try:

@@ -45,9 +45,12 @@ SIZES = (400, 200, 100, 50)
 
 @dataclass(frozen=True)
 class Row:
-    """A training: its scene's folder and settings. {stop} is the step at which the short schedule's growth ends.
-    half_of: names of rows of this scene; the maximum number of Gaussians is half that of the better row. sizes: picture
-    sizes at which the model is also measured."""
+    """A training: its scene's folder and settings.
+
+    settings: {stop} in them is the step at which the short schedule's growth ends.
+    half_of: names of rows of this scene; the maximum number of Gaussians is half that of the better row.
+    sizes: picture sizes at which the model is also measured.
+    """
 
     name: str
     scene: str
@@ -75,7 +78,7 @@ photographs, the dependence on direction is learnt wrongly, and the more so the 
 
 
 def growth_rows() -> list[Row]:
-    """Rows with the paper's growth, and other growths with half as many Gaussians as the better of those."""
+    """Rows with the paper's growth, and others with half as many Gaussians as the better of default and short."""
     rows = []
     for scene in SCENES:
         rows += [Row(f"{scene} {name}", scene, settings) for name, settings in WHOLES.items()]
@@ -143,12 +146,13 @@ class Book:
         folder.mkdir(parents=True, exist_ok=True)
 
     def results(self, table: str, row: Row, rows: Sequence[Row]) -> list[Finished]:
-        """The row's training for each seed; unfinished ones are trained."""
+        """The row's training for each seed; unfinished ones are trained. rows: those that `half_of` may name."""
         most = self._most(table, row, rows)
         return [self._result(table, row, seed, most[seed]) for seed in range(self.seeds)]
 
     def _most(self, table: str, row: Row, rows: Sequence[Row]) -> list[tuple[str, ...]]:
-        """Settings per seed: half of the better row's Gaussians with the same seed, so that seeds are independent."""
+        """Settings per seed: half of the Gaussians of the better row of `half_of`, trained with the same seed, so that
+        seeds are independent."""
         if not row.half_of:
             return [()] * self.seeds
         others = [self.results(table, other, rows) for other in rows if other.name in row.half_of]

@@ -23,12 +23,13 @@ BLOCK = "0000_0000/"
 
 
 def towns(given: Namespace) -> Rows:
-    """Towns of growing size, then a town in metres, millimetres and kilometres: each is trained with the length unit of
-    its depths, and with its extent where that differs.
+    """Towns of growing size, then a town in metres, millimetres and kilometres. Each is trained with the length unit
+    that follows from its depths, and again with its extent, where that differs.
 
-    All towns have as many photographs and Gaussians a block, and as many passes. PSNR is that of all held-out
-    photographs, of those in the first town, and of those of block 0, 0. With --own-block the growing towns' photographs
-    count only where they show their own block, and in the first row each block of the first town is trained alone.
+    All towns have the same number of photographs and of Gaussians per block, and of passes. PSNR is that of all
+    held-out photographs, of those of the first town's blocks, and of those of block 0, 0. With --own-block the growing
+    towns' photographs count only where they show their own block. The first row then has the first town's blocks, each
+    trained alone.
     """
     renderer = Renderer(open_device())
     yield "town", "metres a unit", "unit", "steps", "Gaussians", "PSNR, dB", "first town", "block 0, 0", "seconds"

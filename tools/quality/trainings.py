@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings of the experiments: each is done once and resumed; its model, evaluation and PSNR."""
+"""Run the experiments' trainings, each once or resumed, and read their models, evaluations and PSNR."""
 
 from __future__ import annotations
 
@@ -77,8 +77,9 @@ def trained(
     """Train a row, or continue its interrupted training. A finished run is not repeated.
 
     scene: a folder, or a scene that `clsplat train` gets instead of a folder's contents.
-    settings, usual: settings in addition to iterations, resolution and seed. `settings` take precedence over `usual`,
-    and these over the settings of --with.
+    words: further arguments of `clsplat train`.
+    settings: `name=value,...`; if empty, the settings of --with. They take precedence over `usual`.
+    usual: settings in addition to iterations, resolution and seed.
     """
     settings = settings or getattr(given, "settings", "")
     usual = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiment of view orders: the price of near views in quality, and how many Gaussians a step has to fetch."""
+"""The experiment of view orders: how much quality near views cost, and how many Gaussians a step has to fetch."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ STORE = 0.5
 def orders(given: Namespace) -> Rows:
     """Held-out PSNR of scenes trained with --view-order random and near, with several seeds.
 
-    The last columns are of the last model, at the photographs' size: the share of its Gaussians that a view shows, and,
-    of these, the share that the view before shows too, and the share that is to be fetched into a store of half the
-    model, which keeps the Gaussians that were in view last.
+    The last columns are of the last seed's model, at the photographs' size. "in view" is the share of its Gaussians
+    that a view shows. "of them before" is the share of the Gaussians in view that the view before shows too. "fetched"
+    is the share of the Gaussians in view that are fetched into a store of half the model. The store keeps the Gaussians
+    that were in view last.
     """
     yield "scene", "order", "PSNR, dB", "of the seeds", "Gaussians", "in view", "of them before", "fetched"
     for path in given.scenes:
@@ -53,7 +54,7 @@ def orders(given: Namespace) -> Rows:
 
 
 def shown(scene: Scene, gaussians: Gaussians) -> Bool:
-    """Gaussians that each training view shows, (views, n)."""
+    """Mask (views, n) of the Gaussians that each training view shows."""
     device = open_device()
     rasterizer, model = Rasterizer(device, antialiased=gaussians.antialiased), upload_gaussians(device, gaussians)
     background = upload(device, np.zeros(3, np.float32))
@@ -66,7 +67,11 @@ def shown(scene: Scene, gaussians: Gaussians) -> Bool:
 
 
 def shares(seen: Bool, queue: list[int]) -> tuple[float, float, float]:
-    """Shares of `orders`: Gaussians in view, of them those that the view before shows, and those to be fetched."""
+    """The last three columns of `orders`, as fractions.
+
+    seen: from `shown`.
+    queue: the order of views, as indices.
+    """
     steps = range(1, min(len(queue), MOST_STEPS + 1))
     common = [np.count_nonzero(seen[a] & seen[b]) / max(seen[b].sum(), 1) for a, b in pairwise(queue)]
     total = sum(seen[queue[step]].sum() for step in steps)
@@ -75,7 +80,7 @@ def shares(seen: Bool, queue: list[int]) -> tuple[float, float, float]:
 
 
 def stored(seen: Bool, queue: list[int]) -> Bool:
-    """Gaussians in the store after the views of a queue: those of the last views that fit together."""
+    """Mask (n,) of the Gaussians in the store after the views of a queue: those of the last views that fit together."""
     held = np.zeros(seen.shape[1], bool)
     for view in reversed(queue):
         more = held | seen[view]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The readers of files that others made, a valid file for each, and ways to spoil it; see `stress_files.py`."""
+"""The readers of files from other people, a valid file for each, and ways to spoil it; see `stress_files.py`."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ def read_cameras(folder: Path, name: str) -> None:
     for camera in shot.cameras:
         numbers = (camera.rotation, camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
         if not all(np.isfinite(values).all() for values in numbers) or min(camera.fx, camera.fy) <= 0:
-            raise AssertionError(f"a camera {camera}")
+            raise AssertionError(f"a camera with invalid numbers, expected finite ones and fx, fy over 0: {camera}")
 
 
 def inside(folder: Path, path: Path) -> None:
@@ -327,7 +327,7 @@ def read_picture(path: Path) -> None:
     image_size(path)
     image = read_image(path)
     if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (3, 4) or not np.isfinite(image).all():
-        raise AssertionError(f"image {image.dtype} {image.shape}")
+        raise AssertionError(f"image {image.dtype} {image.shape}, expected finite float32 of 3 or 4 channels")
 
 
 def read_run(folder: Path) -> None:
@@ -346,7 +346,7 @@ def read_checkpoint(folder: Path) -> None:
     if checkpoint is not None:
         total = sum(array.nbytes for array in checkpoint.arrays.values())
         if total > MOST_BYTES:
-            raise AssertionError(f"{total} bytes of arrays")
+            raise AssertionError(f"{total} bytes of arrays in a checkpoint, expected at most {MOST_BYTES}")
 
 
 def read_photos(folder: Path) -> None:
@@ -464,7 +464,7 @@ READERS = {reader.name: reader for reader in _ALL}
 
 
 def spoil(reader: Reader, folder: Path, rng: random.Random) -> str:
-    """Spoil files of the reader one to three times, and return a description of it."""
+    """Spoil files of the reader one to three times, and return a description of the changes."""
     said = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         path = folder / rng.choice(reader.files)

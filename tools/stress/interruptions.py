@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""How every verb ends after a signal, on a full disk, with a closed stream, or next to another process.
+"""Test how every verb ends after a signal, on a full disk, with a closed stream, or next to another process.
 
     python tools/stress/interruptions.py [--verbs train,eval] [--events SIGINT,2>&-] [--markdown]
 
@@ -47,8 +47,8 @@ class Verb:
     """A call of a verb.
 
     words: its command line, with {scene}, {photos}, {run}, {other}, {model} and {out}, the folder that it writes to.
-    ready: event that shows that it is at work. /PATTERN: a file exists below {out}. !NAME: Python has raised this audit
-        event. A name of a module: the module is imported.
+    ready: event that shows that the verb is at work. /PATTERN: a file below {out} matches it. !NAME: Python has raised
+        this audit event. A name of a module: the module is imported.
     writes: True if it writes files.
     """
 
@@ -155,7 +155,7 @@ class Bench:
             raise SystemExit(f"{' '.join(words)}: {done.stderr}")
 
     def words(self, verb: Verb, out: Path, *, ends: bool = False) -> list[str]:
-        """Words of the call. For verbs that write into a run, copies the finished run into `out` first.
+        """The verb's command line. For verbs that write into a run, copies the finished run into `out` first.
 
         ends: True for a short training that ends by itself, and so also writes the files of its end.
         """
@@ -185,7 +185,7 @@ def keep_apart(folder: Path) -> None:
 
 @contextmanager
 def fresh(folder: Path) -> Iterator[Path]:
-    """A new folder below `folder`, which is removed after the block."""
+    """A context manager that makes a new folder below `folder`, and removes it in the end."""
     out = Path(tempfile.mkdtemp(prefix="out-", dir=folder))
     try:
         yield out
@@ -195,9 +195,9 @@ def fresh(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def full_disk(folder: Path, before: int) -> Iterator[tuple[Path, Callable[[], None] | None]]:
-    """A folder on a disk with room for `before` and FULL bytes.
+    """A context manager with a folder on a disk that has room for `before` + FULL bytes. It gives the folder and None.
 
-    If no disk can be mounted, it is an ordinary folder, with a function that limits the size of a child process's
+    If no disk can be mounted, it gives an ordinary folder, and a function that limits the size of a child process's
     files.
     """
     with fresh(folder) as out:
@@ -221,7 +221,11 @@ def full_disk(folder: Path, before: int) -> Iterator[tuple[Path, Callable[[], No
 
 
 def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, names: dict[str, str]) -> Outcome:
-    """Outcome of a process that has ended. done: its exit status and its output."""
+    """Outcome of a process that has ended.
+
+    done: its exit status and its output.
+    names: paths by name; in the outcome, the name replaces the path.
+    """
     status, text = done
     lines = [line for line in text.splitlines() if line.strip()]
     told = lines[-1] if lines else ""
@@ -295,7 +299,7 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
     before = sum(path.stat().st_size + 4096 for path in (bench.folder / "run").rglob("*")) if verb.in_a_run else 0
     with full_disk(bench.folder, before) as (out, limit):
         words = bench.words(verb, out, ends=True)
-        left = FULL // 4 if verb.ready.startswith("/") else 0  # these verbs are to fail in the middle of their work
+        left = FULL // 4 if verb.ready.startswith("/") else 0  # so that these verbs fail in the middle of their work
         if limit is None:
             with suppress(OSError), open(out / "filler", "wb", buffering=0) as filler:
                 filler.write(bytes(max(shutil.disk_usage(out).free - left, 0)))
@@ -386,7 +390,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"{unknown[0]}: expected some of {', '.join(of)}")
     verbs = [known[name] for name in names]
     for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
-        signal.signal(number, handler)  # a shell's `&` and nohup ignore them, and child processes would inherit this
+        signal.signal(number, handler)  # after a shell's `&` or nohup, child processes would ignore these signals
     outcomes = []
     with tempfile.TemporaryDirectory(prefix="clsplat-interruptions-") as folder:
         keep_apart(Path(folder))
@@ -395,7 +399,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for verb in verbs:
                 found = outcome(bench, verb, event)
                 outcomes.append(found)
-                mark = "" if found.sound else "  <- not as it should be"
+                mark = "" if found.sound else "  <- expected an exit status without a traceback"
                 print(f"{event}: {found.verb}: {found.status}: {found.told}{mark}", file=sys.stderr, flush=True)
     if options.markdown:
         print(tables(outcomes))

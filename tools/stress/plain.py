@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plain of cells for tests of large models, made by a seed: Gaussians cell by cell, and cameras above it.
+"""Make a scene for tests of large models: a plain of cells with Gaussians, each made from a seed, and cameras above it.
 
-It uses little of the package, so that other versions of it can be measured on the same scene.
+This module uses little of clsplat, so that other versions of clsplat can be measured on the same scene.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class SeededArray:
     shape: tuple[int, ...]
 
     def get_rows(self, start: int, stop: int) -> Float32:
-        """Rows [start, stop), from whole cells."""
+        """Rows [start, stop), cut from whole cells."""
         cells = range(start // CELL_ROWS, -(-stop // CELL_ROWS))
         made = np.concatenate([_cell(self.group, number, self.shape[1:]) for number in cells])
         first = CELL_ROWS * cells[0]
@@ -65,7 +65,7 @@ def _every_second_bit(number: int) -> int:
 def write_scene(folder: Path, cells: int, views: int, *, near: bool, height: float = CAMERA_HEIGHT) -> None:
     """Write a COLMAP folder of cameras above the plain, which look down, with photographs of noise.
 
-    near: the cameras stand beside each other, as on a flight; otherwise anywhere.
+    near: True for cameras beside each other, as on a flight; False for cameras anywhere.
     height: of the cameras above the plain, world units.
     """
     rng = np.random.default_rng(1)
@@ -87,7 +87,7 @@ def write_scene(folder: Path, cells: int, views: int, *, near: bool, height: flo
 
 
 def settings(steps: int, degree: int, *, dense: bool) -> TrainConfig:
-    """Settings of a training whose rows stay where they are."""
+    """Settings of a training without density control, so that rows stay where they are. dense: True for dense Adam."""
     optimiser, density = OptimiserConfig(sparse=not dense), DensityConfig(every=0)
     iterations = max(steps, 1000)
     return TrainConfig(

@@ -6,7 +6,7 @@
 All processes share a new folder of caches, like the processes of a farm that share a home folder. Interrupted processes
 get in turn Ctrl-C for their whole process group, SIGTERM and SIGKILL, at random times during the first builds. All
 others must write the same picture as a process that runs alone. Then one more process must write it with the cache that
-is left. The exit status is 1 if a process does not, otherwise 0. The result is printed as JSON.
+is left. The exit status is 0 if all these pictures are right, otherwise 1. The result is printed as JSON.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def stress(folder: Path, processes: int, interrupted: int, device: str | None, c
     alone, start = environment(folder / "alone"), time.monotonic()
     first = Started(model, folder / "alone.png", alone, device)
     if (end := first.end(None, start + DEADLINE)) != "right":
-        raise SystemExit(f"a process alone ends so: {end}")
+        raise SystemExit(f"clsplat thumbnail, run alone: {end}, expected a picture")
     wanted, seconds = first.picture.read_bytes(), time.monotonic() - start
 
     shared, start = environment(folder / "shared"), time.monotonic()

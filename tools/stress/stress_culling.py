@@ -4,10 +4,10 @@
     tools/stress/run culling [--pairs 1e6] [--seed 0] [--device DEVICE]
 
 A pair is a camera and a box of Gaussians, most of them at a border of the picture. The box is measured; then Adam moves
-the Gaussians for up to 300 steps that show them and 5000 that do not, by random and adversarial gradients. The widened
-box must be visible if one of the Gaussians has a tile, in float64 or by a device's kernels. Prints a table with, for
-each kind of camera, the pairs, those with a tile, those found visible, and the Gaussians missed. The exit status is 1
-if a Gaussian is missed.
+the Gaussians for up to 300 steps that show them and 5000 that do not, by random and adversarial gradients. The box,
+widened by the bound of these movements, must be visible if one of the Gaussians has a tile, in float64 or, with
+--device, by a device's kernels. Prints a table with, for each kind of camera, the pairs, those with a tile, those found
+visible, and the Gaussians missed. The exit status is 1 if a Gaussian is missed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ STEPS = ((0, 0), (1, 0), (1, 1), (1, 5000), (10, 0), (10, 30), (100, 1000), (300
 
 @dataclass
 class Tally:
-    """Numbers of pairs, and of Gaussians that were missed."""
+    """Numbers of pairs: all, with a tile (`reached`), and found visible. missed: number of Gaussians missed."""
 
     pairs: int = 0
     reached: int = 0
@@ -60,6 +60,7 @@ def paths(rng: np.random.Generator, shown: int, hidden: int, count: int, config:
 
     The gradients are, in equal parts: random; of one sign; growing by b2 / b1 from step to step, for which the bound is
     tight; random with large ones among small ones.
+    shown, hidden: numbers of steps with gradients, and of later steps without any.
     """
     kinds = np.arange(count) % 4
     m: Float32 = np.zeros(count, np.float32)
@@ -80,14 +81,17 @@ def paths(rng: np.random.Generator, shown: int, hidden: int, count: int, config:
 
 
 def random_rotation(rng: np.random.Generator) -> Float64:
-    """A random rotation, one in eight times a reflection."""
+    """A random rotation, in one of eight cases combined with a reflection."""
     quaternion = rng.standard_normal(4)
     rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion))
     return rotation * [1.0, 1.0, -1.0] if rng.random() < 0.125 else rotation
 
 
 def base_camera(rng: np.random.Generator, focal: float) -> Camera:
-    """A camera at a random place, up to 1e4 from the origin, with a principal point in its picture."""
+    """A camera at a random place, up to 1e4 from the origin, with a principal point in its picture.
+
+    focal: mean focal length, relative to the picture's width.
+    """
     width, height = (int(side) for side in rng.integers(1, 400, 2))
     rotation, position = random_rotation(rng), rng.standard_normal(3) * 10.0 ** rng.uniform(-1, 4)
     fx, fy = focal * width * np.exp(rng.uniform(-0.3, 0.3, 2))
@@ -167,9 +171,10 @@ def at_borders(rng: np.random.Generator, camera: Camera, count: int) -> tuple[Fl
 
 
 def rows_of(rng: np.random.Generator, camera: Camera, boxes: int) -> tuple[Float32, Float32, Float32, Float32, Float64]:
-    """Gaussians (boxes, ROWS, ...): means, quaternions, log scales and logits of opacities. And distances (boxes,).
+    """Means, quaternions, log scales and opacity logits (boxes, ROWS, ...), and the boxes' distances from the camera.
 
-    Two in four means are corners of their box. Two in four have the largest scale on all axes, one is a needle.
+    Of four Gaussians, two have means at corners of their box. Two have the largest scale on all axes, and one is a
+    needle.
     """
     points, distances = at_borders(rng, camera, boxes)
     half = distances[:, None] * 10.0 ** rng.uniform(-4, 0.3, (boxes, 3))
@@ -216,7 +221,7 @@ class Movements:
 
 
 def by_kernels(device: Device) -> Reach:
-    """The Gaussians to which the kernels of projection give a tile."""
+    """A `Reach` by the kernels of projection: it finds the Gaussians to which they give a tile."""
     work = Workspace(device)
 
     def reach(means: Float64, quaternions: Float64, log_scales: Float64, logits: Float64, camera: Camera) -> Bool:
@@ -234,7 +239,11 @@ def by_kernels(device: Device) -> Reach:
 def compare(
     rng: np.random.Generator, kind: str, movements: Movements, reach: Reach = reach_a_tile, boxes: int = BOXES
 ) -> tuple[Tally, Camera]:
-    """Compare culling with every Gaussian, for a camera of this kind. Returns the numbers, and the camera."""
+    """Compare culling with every Gaussian, for a camera of this kind. Returns the numbers, and the camera.
+
+    kind: a key of KINDS.
+    boxes: number of boxes.
+    """
     camera = KINDS[kind](rng)
     means, quaternions, log_scales, logits, distances = rows_of(rng, camera, boxes)
     lowest, highest = means.min(axis=1).astype(np.float64), means.max(axis=1).astype(np.float64)

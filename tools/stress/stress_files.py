@@ -5,8 +5,8 @@
     tools/stress/run files --readers ply --first 1234 --cases 1        # a case again, by its number
 
 A case passes if the reader returns, or raises an InputError of one line that names a file. Everything else is a
-failure: another exception, a warning of several lines, a crash of the process, over --seconds of CPU time, or over
---memory MiB. The spoilt files of failures are kept in the folder --keep. The exit status is 1 if there was a failure.
+failure: another exception, a warning of several lines, a crash of the process, more than --seconds of CPU time, or more
+than --memory MiB. The spoilt files of failures are kept in the folder --keep. The exit status is 1 after a failure.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ machine."""
 class Tally:
     """Counts of a reader's cases.
 
+    refused: number of cases in which the reader raised an error.
     slowest: seconds and number of the slowest case.
     peak: additional MiB and number of the case that took most memory.
     """
@@ -94,7 +95,8 @@ def verdict(reader: Reader, folder: Path) -> tuple[bool, str]:
 
 @contextlib.contextmanager
 def spoilt(reader: Reader, valid: Path, folder: Path, seed: int, case: int) -> Iterator[str]:
-    """Make `folder` a spoilt copy of the reader's valid files within the block. Yields a description of the changes."""
+    """A context manager, inside which `folder` is a spoilt copy of the reader's valid files. It gives a description of
+    the changes."""
     shutil.copytree(valid, folder, symlinks=True)
     try:
         yield spoil(reader, folder, numbered(seed, reader.name, case))
@@ -113,6 +115,7 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seco
 
     tasks: receives (reader, first, stop). Sends ("case", number) and ("done", seconds, MiB, refused, trouble) for each
     case, then ("end",).
+    memory, most_seconds: maximum MiB and CPU seconds of a case; with more it fails.
     """
     import signal
 
@@ -211,7 +214,11 @@ def stress(
     memory: int = 1024,
     seconds: float = 20.0,
 ) -> dict[str, Tally]:
-    """Run `cases` cases, divided among the readers by their weights. Returns the tally of each reader."""
+    """Run `cases` cases, divided among the readers by their weights. Returns the tally of each reader.
+
+    first: number of each reader's first case.
+    memory, seconds: maximum MiB and CPU seconds of a case; with more it fails.
+    """
     weights = {name: READERS[name].weight for name in names}
     share = {name: max(round(cases * weight / sum(weights.values())), 1) for name, weight in weights.items()}
     chunks = [
@@ -253,7 +260,7 @@ def _sum(parts: list[Tally]) -> Tally:
 
 
 def keep(folder: Path, name: str, case: int, seed: int) -> Path:
-    """Make the files of a case again, in a folder of their own, and return it."""
+    """Make the files of a case again, in a folder of their own inside `folder`, and return that folder."""
     target = folder / f"{name}-{case}"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
@@ -287,7 +294,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     names = options.readers.split(",")
     if unknown := [name for name in names if name not in READERS]:
-        print(f"stress_files: error: no reader {unknown[0]!r}, expected of {', '.join(READERS)}", file=sys.stderr)
+        print(f"stress_files: error: no reader {unknown[0]!r}, expected some of {', '.join(READERS)}", file=sys.stderr)
         return 2
     limits: dict[str, Any] = {"jobs": options.jobs, "memory": options.memory, "seconds": options.seconds}
     tallies = stress(names, options.cases, seed=options.seed, first=options.first, **limits)

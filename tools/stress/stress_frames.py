@@ -51,13 +51,13 @@ def _made(cloud: Cloud) -> Scene:
 
 
 def counts(rng: np.random.Generator) -> Scene:
-    """Numbers of Gaussians around powers of two: 0, 1, 2^k - 1, 2^k, 2^k + 1."""
+    """A number of Gaussians around a power of two: 2^k - 1, 2^k or 2^k + 1."""
     count = max(0, 2 ** int(rng.integers(0, 10)) + int(rng.integers(-1, 2)))
     return _made(scene_of(rng, count, 40, 24)[0])
 
 
 def sizes(rng: np.random.Generator) -> Scene:
-    """Image sizes such as 1x1, 1xN and Nx1, most of which are not multiples of a tile."""
+    """An image of a size such as 1x1, 1xN or Nx1. Most sizes are not multiples of a tile."""
     width, height = (int(rng.choice([1, 1, 2, 15, 16, 17, 31, 33, 50])) for _ in range(2))
     return _made(scene_of(rng, 48, width, height)[0])
 
@@ -116,7 +116,7 @@ def off_frustum(rng: np.random.Generator) -> Scene:
 
 
 def bright(rng: np.random.Generator) -> Scene:
-    """Colours far outside [0, 1]."""
+    """Gaussians with colours far outside [0, 1]."""
     cloud, _ = scene_of(rng, 64, 32, 24)
     cloud.sh *= 10 ** rng.uniform(0, 6, (64, 1, 1))
     return _made(cloud)

@@ -64,13 +64,13 @@ class Tally:
     hurt: list[Array] = field(default_factory=list)
 
     def add_norms(self, norms: Mapping[str, tuple[float, float]]) -> None:
-        """Add the sums of squares."""
+        """Add to the sums of squares in `norms`."""
         for name, (off, size) in norms.items():
             before = self.norms.get(name, (0.0, 0.0))
             self.norms[name] = (before[0] + off, before[1] + size)
 
     def add_errors(self, errors: Mapping[str, Array]) -> None:
-        """Add errors. float32 is precise enough for them."""
+        """Add to `errors`, in float32, which is precise enough."""
         for name, values in errors.items():
             self.errors.setdefault(name, []).append(np.asarray(values, np.float32))
 
@@ -139,7 +139,7 @@ def judged(name: str, tally: Tally) -> Result:
 
 
 def frames(device: Device, name: str, many: int, seed: int, every: Tally | None = None) -> Result:
-    """The row of `many` frames of one kind. every: tally to which their gradients are added."""
+    """The row of `many` frames of one kind. every: tally to which the errors of their gradients are added."""
     image = flips = 0.0
     pixels = band = cases = broken = 0
     tally = Tally()

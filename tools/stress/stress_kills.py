@@ -9,8 +9,8 @@ its start (imports, building of kernels, reading the checkpoint) and its end. A 
 undisturbed one: the bytes of model.ply, and the steps in metrics.jsonl. The exit status is 1 if these differ, or if a
 process fails.
 
---scratch: the model begins with 11,364 Gaussians, counts as a large one, and is in a scratch file under --max-host-mem
-4MiB. It is compared with one that was trained without a limit.
+--scratch: the model begins with 11,364 Gaussians, counts as a large one, and is kept in a scratch file because of
+--max-host-mem 4MiB. It is compared with one that was trained without a limit.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def half_written(run: Path) -> set[str]:
 
 
 def end_of(process: subprocess.Popen[str]) -> str:
-    """Wait until the training is finished. Returns what it told. Raises ClsplatError with its end if it fails or
-    hangs."""
+    """Wait until the training is finished. Returns what it printed on standard error. Raises ClsplatError if the
+    training fails or hangs."""
     try:
         _, said = process.communicate(timeout=DEADLINE)
     except subprocess.TimeoutExpired as error:
@@ -100,7 +100,7 @@ def end_of(process: subprocess.Popen[str]) -> str:
 
 
 def tail(said: str) -> str:
-    """The end of what a process told, in one line."""
+    """The end of what a process printed, in one line."""
     return " ".join(said.split())[-400:]
 
 
@@ -108,7 +108,7 @@ class Killer:
     """Kills trainings at random times.
 
     start: function that starts a training in a folder, or resumes the one there.
-    compare: function that raises ClsplatError if a finished one is not as it should be.
+    compare: function that raises ClsplatError if a finished training is not as expected.
     lifetime: seconds of a training that is not killed.
     """
 
@@ -165,7 +165,7 @@ class Killer:
         try:
             self._compare(run)
         except ClsplatError as error:
-            raise ClsplatError(f"after {self.figures.kills} kills {error}") from None
+            raise ClsplatError(f"after {self.figures.kills} kills: {error}") from None
         self.figures.compared += 1
 
 
@@ -201,14 +201,14 @@ class Kills:
     def compare(self, run: Path) -> None:
         """Raise ClsplatError if a finished run differs from the undisturbed one."""
         if (run / "model.ply").read_bytes() != self.model:
-            raise ClsplatError("model.ply differs")
+            raise ClsplatError(f"{run}/model.ply: has other bytes than that of the undisturbed run, expected the same")
         if (steps := self.steps_of(run)) != self.steps:
-            raise ClsplatError(f"metrics.jsonl has the steps {steps}")
+            raise ClsplatError(f"{run}/metrics.jsonl: has the steps {steps}, expected {self.steps}")
         if left := list(run.rglob(".*.clsplat-tmp")):
-            raise ClsplatError(f"a half-written file has stayed: {left[0].name}")
+            raise ClsplatError(f"{left[0]}: is a half-written file, expected none after the training's end")
         named = {manifest.path for _, manifest in Run.open(run).manifests()}
         if named != set(run.absolute().glob("scratch/*")) or bool(named) != (self.scratch and run != self.whole):
-            raise ClsplatError(f"{run}/scratch has not the files that checkpoints name, {named}")
+            raise ClsplatError(f"{run}/scratch: expected only the files that checkpoints name, {named}")
 
     def survive(self, count: int, seed: int) -> Figures:
         """Kill `count` times (`Killer.survive`)."""

@@ -4,11 +4,11 @@
     tools/stress/run large [--gaussians 20e6] [--degree 3] [--steps 300] [--max-host-mem 4GiB] [--max-device-mem SIZE]
         [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE] [--json] [--control SHARE]
 
-The model is a plain of cells, a chunk of Gaussians each, made by a seed block by block; each camera looks at a small
-part of it. Prints the time of a step, the bytes that a step moves, the peak of anonymous and shared memory, and a
-digest of parameters and moments after the last step, which is the same at every limit. With --control, density control
-follows, which clones some Gaussians of a share of the chunks and removes others: its time, the bytes that this process
-reads and writes for it (Linux), and its peak.
+The model is a plain of cells, each with a chunk of Gaussians that are made from a seed. Each camera looks at a small
+part of the plain. Prints the time of a step, the bytes that a step moves, and the peak of anonymous and shared memory.
+Also prints a digest of parameters and moments after the last step, which is the same at every limit. With --control,
+density control follows: in a share of the chunks it clones some Gaussians and removes others. Then its time, its peak,
+and the bytes that this process reads and writes for it (Linux) are printed too.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class MemoryPeak:
 
 
 def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int, scratch: Path) -> Trainer:
-    """A trainer whose model is the plain."""
+    """A trainer whose model is the plain. arguments: the command line's. count: number of Gaussians."""
     limit = parse_bytes(arguments.max_host_mem, "--max-host-mem")
     memory = UNLIMITED if limit is None else HostMemory(limit=limit, scratch=scratch, owner="large")
     device = open_device(arguments.device, memory_limit=parse_bytes(arguments.max_device_mem, "--max-device-mem"))
@@ -98,7 +98,7 @@ def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int,
 
 
 def changed_rows(count: int, share: float) -> NDArray[np.uint32]:
-    """Rows of the plain after density control: in every chunk of a share of them some are cloned, others removed."""
+    """Rows of the plain after density control, which clones some rows and removes others in a share of the chunks."""
     rng, parts, changes = np.random.default_rng(2), [], False
     for number, first in enumerate(range(0, count, CHUNK_ROWS)):
         rows = np.arange(first, min(first + CHUNK_ROWS, count), dtype=np.uint32)
@@ -120,7 +120,7 @@ def moved_by_process() -> tuple[int, int]:
 
 
 def control(trainer: Trainer, share: float) -> str:
-    """Run density control, and say what it took."""
+    """Run density control in a share of the chunks, and return text with its time, bytes and peak."""
     count = trainer.parameters.count
     rows = changed_rows(count, share)
     plan = RowPlan(listed=SourceList(rows, np.zeros(0, np.uint32)), new_statistics=True)

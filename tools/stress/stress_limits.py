@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train one scene at many limits of memory, on parts of a device, watched and killed, and compare the models' bytes.
+"""Train one scene at many limits of memory, on parts of a device, with a viewer and kills, and compare models' bytes.
 
     tools/stress/run limits [--gaussians 3e5] [--steps 90] [--views 24] [--kills 20] [--seed 0] [--only WORD,...]
         [--devices DEVICE,...]
 
-The scene is the plain of `run large`, with a point for each Gaussian to begin with. Density control, SH degrees,
-opacity resets, warm-up sizes and checkpoints come in between. Prints a table: the limit, the peak of anonymous and
-shared memory, steps a second, and a digest of model.ply and of the losses in metrics.jsonl. The exit status is 1 if a
-digest differs from that of the training without a limit on the same device, or of the same batch, or if one fails.
+The scene is the plain of `run large`, with a point for each Gaussian to begin with. The trainings include density
+control, new SH degrees, opacity resets, warm-up sizes and checkpoints. Prints a table: the limit, the peak of anonymous
+and shared memory, steps a second, and a digest of model.ply and of the losses in metrics.jsonl. Trainings on one device
+with as many views a step must have the digest of the one without a limit. The exit status is 1 if a digest differs, or
+if a training fails.
 
---devices: devices of clsplat devices, of which the first trains under all circumstances, others without a limit and at
-two. If not given: one of each driver. --only: rows of the table whose names have one of the words, and those that they
-are compared with.
+--devices: devices as listed by `clsplat devices`. The first one trains all rows that name no device, the others train
+without a limit and at two limits. If not given: one of each driver. --only: rows of the table whose names have one of
+the words, and those that they are compared with.
 """
 
 from __future__ import annotations
@@ -70,10 +71,11 @@ sys.exit(main(sys.argv[1:]))
 class Case:
     """A row of the table.
 
-    name: what is done.
-    flags: the flags that must change no byte.
-    like: name of the row whose bytes it must have; its own for those that others are compared with.
-    least: True for the least main memory that does, as a training with less is told.
+    like: name of the row whose bytes this one must have; its own name for a row that others are compared with.
+    flags: flags of `clsplat train`.
+    least: True to train with the least --max-host-mem that is enough. The error of a training with less tells it.
+    watched: True to train with a viewer.
+    killed: True to kill and resume the training.
     """
 
     name: str
@@ -89,7 +91,7 @@ class Result:
     """Result of a row.
 
     digests: of the model, or of the models of several trainings; none if a training failed.
-    said: what else is to be told.
+    said: further text for the table.
     """
 
     digests: set[str]
@@ -130,7 +132,7 @@ def cases(model: int, first: str, others: Sequence[str]) -> list[Case]:
 
 
 def settings(count: int, steps: int) -> list[str]:
-    """Flags of every training, so that its events come within these steps."""
+    """Flags of every training. Density control, opacity resets and the like take place within these steps."""
 
     def at(share: float) -> str:
         return str(max(int(share * steps), 1))
@@ -145,7 +147,7 @@ def settings(count: int, steps: int) -> list[str]:
 
 
 def write_points(path: Path, count: int) -> None:
-    """Write the means of the plain as a PLY of grey and coloured points."""
+    """Write the means of the plain as a PLY of points in random colours."""
     points = np.zeros(count, [(axis, "<f4") for axis in "xyz"] + [(each, "u1") for each in ("red", "green", "blue")])
     places = SeededArray("means", (count, 3)).get()
     colours = np.random.default_rng(2).integers(0, 256, (count, 3))
@@ -180,18 +182,18 @@ class Trainings:
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     def least(self, case: Case) -> tuple[str, ...]:
-        """The limit of a case that has the least, as flags; nothing for others."""
+        """The flags of the least limit, if the case has it; none for other cases. Raises ClsplatError."""
         if not case.least:
             return ()
         refused = self.start(case, self.folder / "refused", "--max-host-mem", TOO_LITTLE)
         _, said = refused.communicate(timeout=DEADLINE)
         found = re.search(r"expected at least (\d+MiB)", said)
         if found is None:
-            raise ClsplatError(f"--max-host-mem {TOO_LITTLE}: expected the least that does, found {tail(said)}")
+            raise ClsplatError(f"--max-host-mem {TOO_LITTLE}: expected an error with the least, found {tail(said)}")
         return "--max-host-mem", found[1]
 
     def trained(self, case: Case, limit: tuple[str, ...]) -> Result:
-        """Train, and say what it took."""
+        """Train a case, and return its row's result. limit: from `least`."""
         run = self.folder / "run"
         shutil.rmtree(run, ignore_errors=True)
         process, begun = self.start(case, run, *limit), time.monotonic()
@@ -200,11 +202,11 @@ class Trainings:
         self.seconds[case.flags] = time.monotonic() - begun
         pictures = re.search(r"(\d+) pictures", said)
         if case.watched and (pictures is None or pictures[1] == "0"):
-            raise ClsplatError(f"{case.name}: expected pictures, found {tail(said)}")
+            raise ClsplatError(f"{case.name}: expected pictures for the viewer, found {tail(said)}")
         return Result({digest(run)}, pictures[0] if pictures else "", f"{peak.bytes / 2**20:,.0f} MiB", rate(run))
 
     def killed(self, case: Case) -> Result:
-        """Train, with kills at random times."""
+        """Train a case with kills at random times, and return its row's result."""
         run, digests = self.folder / "run", set[str]()
         shutil.rmtree(run, ignore_errors=True)
 
@@ -240,14 +242,14 @@ Page = Callable[[Scene, TrainConfig], AbstractContextManager[Any]]
 
 
 class Visitor:
-    """A viewer whose camera moves before each step, and who counts the pictures."""
+    """A viewer whose camera moves before each step. It counts the pictures."""
 
     def __init__(self, view: TrainingView, scene: Scene) -> None:
         self.view, self.camera, self.pictures = view, scene.views[0].camera, 0
         self.viewer = view.viewing.join(self)
 
     def __call__(self, trainer: Any, interrupted: Callable[[], bool]) -> None:
-        """Move, and let the training render."""
+        """Move the camera, and let the training render."""
         place = self.camera.position + 0.01 * trainer.step
         self.view.viewing.moved(self.viewer, Pose(self.camera.rotation.T, place, 0.8, 320, 240))
         self.view(trainer, interrupted)
@@ -257,12 +259,12 @@ class Visitor:
         self.pictures += 1
 
     def tell(self, message: str) -> None:
-        """Fail, as only errors are told."""
-        raise ClsplatError(f"the page was told: {message}")
+        """Raise ClsplatError, as a training tells a viewer only errors."""
+        raise ClsplatError(f"the viewer was told: {message}, expected no message")
 
 
 def visited(make: Callable[..., Page]) -> Callable[..., Page]:
-    """A function that opens the page of a training, with a visitor on it."""
+    """A function that makes pages as `make` does, each with a `Visitor`."""
 
     def made(*options: Any) -> Page:
         page = make(*options)
@@ -330,5 +332,5 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def limit_of(flags: Sequence[str]) -> str:
-    """The limit among these flags."""
+    """The memory limit among these flags, with its flag; empty if there is none."""
     return next((f"{flag} {value}" for flag, value in pairwise(flags) if flag.startswith("--max")), "")

@@ -161,7 +161,7 @@ def limits_of_kernels(arrays: Mapping[str, Array], wanted: ProjectedTwin) -> NDA
 
 
 def undecided(arrays: Mapping[str, Array], camera: Camera) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians on a threshold of (13), the near plane or 1/255, within float32's errors."""
+    """Mask (n,) of the Gaussians that are within float32's errors of a threshold of (13): the near plane or 1/255."""
     z = (arrays["means"] @ camera.rotation.T + camera.translation)[:, 2]
     reach = np.abs(arrays["means"]).max(axis=1) + np.abs(camera.translation).max()
     with np.errstate(all="ignore"):
@@ -194,7 +194,7 @@ def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_on
     skipped = undecided(arrays, camera)
     with np.errstate(all="ignore"):
         budget = 2 * np.log(wanted.opacities / ALPHA_MIN)
-    # Ellipses that reach the image by less than this are left out: their alphas are within 2 % of 1/255.
+    # Ellipses that barely reach the image are left out: their largest alphas there are within 2 % of 1/255.
     reaches = wanted.visible & (least_exponent(wanted, camera) < budget - 0.04)
     missing = reaches & ~shown & ~skipped & ~limits_of_kernels(arrays, wanted)
     for i in np.flatnonzero(missing):  # an ellipse may pass between pixel centres
@@ -217,7 +217,7 @@ def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_on
         size = np.sqrt((want.reshape(count, -1) ** 2).sum(axis=1))
         off = np.sqrt((difference**2).sum(axis=1))
         with np.errstate(all="ignore"):
-            # there is no relative error below the smallest normal float, and where the sigmoid ends, at a logit of 87
+            # no relative errors below the smallest normal float, which a sigmoid's gradient reaches at a logit of 87
             errors[f"d {name}"] = np.where(size > TINY, off / size, np.where(off > TINY, np.inf, 0))
         norms[name] = (float((off[both] ** 2).sum()), float((size[both] ** 2).sum()))
     return Outcome({name: np.where(both, e, np.nan).astype(float) for name, e in errors.items()}, norms, shown, broken)

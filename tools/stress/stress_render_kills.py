@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     whole, killed = arguments.output / "whole", arguments.output / "killed"
     for folder in (whole, killed):
         if folder.exists():
-            parser.error(f"{folder} is there already")
+            parser.error(f"{folder}: exists, expected a new folder")
     killed.mkdir(parents=True)
     all_of_it, rest = (command(arguments.render, folder, arguments.extension) for folder in (whole, killed))
     start = time.monotonic()

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a training step by the number of Gaussians, on the plain of `run large`.
+"""Measure the time of a training step by the number of Gaussians, on the plain of `run large`.
 
     tools/stress/run sizes [--gaussians 2e5,6e5,2e6,6e6,20e6] [--degree 3] [--steps 60] [--dense]
         [--before CHECKOUT] [--before-gaussians 6e6] [--device DEVICE] [--json] [--plot FILE]
 
-By default each of 60 views comes once, so that a model in a file has nearly all chunks of a view to fetch.
+By default each of 60 views comes once, so that nearly all chunks of a view are fetched if the model is in a file.
 
 Times are medians: wall time, and in brackets and in the plot the processor time of all threads, which other load
-changes less. A model is all in memory once, and once 0.3 of its parameters and moments are, and the others in a scratch
-file (--max-host-mem). --before: the folder of another version, whose steps are measured on the same scene, up to
---before-gaussians. Each size is trained by a process of its own. The exit status is 1 if the digests of a size differ.
+changes less. A model is trained with everything in memory. It is trained again with 0.3 of its parameters and moments
+in memory, and the others in a scratch file (--max-host-mem). --before: the folder of another version, whose steps are
+measured on the same scene, up to --before-gaussians. Each training has a process of its own. The exit status is 1 if
+the digests of a size differ.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ VIEWS = 60
 
 
 def answer(command: Sequence[str], version: Path) -> Any:
-    """The JSON that a process prints, which imports clsplat from a version's folder. Raises ClsplatError."""
+    """The JSON that a Python process prints. Raises ClsplatError. version: folder from which it imports clsplat."""
     environment = {**os.environ, "PYTHONPATH": str(version)}
     done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -51,7 +52,7 @@ def answer(command: Sequence[str], version: Path) -> Any:
 
 
 def measured(options: Any, count: int) -> dict[str, Any]:
-    """Times of a step by the way (`plain.timed_steps`)."""
+    """Times of a step (`plain.timed_steps`) with this number of Gaussians, keyed by where the model is, or BEFORE."""
     here, on = Path(__file__).resolve().parent, [options.device] if options.device else []
     state = count * MODELS * 4 * floats_of((options.degree + 1) ** 2)
     flags = ["--gaussians", count, "--degree", options.degree, "--steps", options.steps, "--views", VIEWS, "--json"]
@@ -62,7 +63,7 @@ def measured(options: Any, count: int) -> dict[str, Any]:
     for name, more in ((IN_MEMORY, []), (IN_A_FILE, limit)):
         found[name] = answer([str(here / "run"), "large", *map(str, [*flags, *more])], here.parents[1])
     if found[IN_MEMORY]["digest"] != found[IN_A_FILE]["digest"]:
-        raise ClsplatError(f"{count:,} Gaussians: the digests differ, {found}")
+        raise ClsplatError(f"{count:,} Gaussians: the digests differ, expected the same: {found}")
     if options.before is not None and count <= options.before_gaussians:
         with tempfile.TemporaryDirectory() as folder:
             write_scene(Path(folder), -(-count // CELL_ROWS), VIEWS, near=False)
@@ -72,7 +73,7 @@ def measured(options: Any, count: int) -> dict[str, Any]:
 
 
 def both(times: dict[str, float]) -> str:
-    """A step's time and its processor time."""
+    """Text with a step's time and, in brackets, its processor time."""
     return f"{times['median_ms']:.1f} ({times['processor_ms']:.1f})"
 
 

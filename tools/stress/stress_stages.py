@@ -25,7 +25,7 @@ KINDS = ("ordinary", "anisotropy", "edge_on", "off_centre", "focal_lengths")
 
 
 def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[str, Deviation]:
-    """The largest errors of a case over random inputs, half with the case's own sizes, half with random ones."""
+    """The largest errors of a case over `many` random inputs, half with the case's own sizes, half with random ones."""
     worst: dict[str, Deviation] = {}
     work = Workspace(device)
     for turn in range(many):
@@ -38,7 +38,7 @@ def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[
 
 
 def lenses(device: Device, rng: Generator, many: int) -> float:
-    """The largest relative error of the gradients with respect to a lens, over views of the stressors KINDS.
+    """The largest relative error of the gradients with respect to a lens, over `many` views of the stressors KINDS.
 
     The gradients follow from random sums like those of blending's gradient.
     """
@@ -60,7 +60,7 @@ def lenses(device: Device, rng: Generator, many: int) -> float:
 
 
 def stages(device: Device, seed: int, many: int) -> Result:
-    """Errors by name with their bounds, and descriptions of faults."""
+    """Errors by name with their bounds, and descriptions of faults. many: number of inputs for each stage."""
     rng = np.random.default_rng([seed, 77])
     worst = {"lens": Deviation(lenses(device, rng, many), LENS_BOUND)}
     for name, case in CASES.items():

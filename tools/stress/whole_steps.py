@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time steps of a training whose Gaussians are all given to the trainer, by any version of clsplat on PYTHONPATH.
+"""Time steps of a training that gets all its Gaussians in memory, with any version of clsplat on PYTHONPATH.
 
     whole_steps.py FOLDER GAUSSIANS DEGREE STEPS DENSE [DEVICE]
 

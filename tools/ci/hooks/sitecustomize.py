@@ -18,7 +18,10 @@ child of an emulator's process would run on the real processor."""
 
 
 class _Hider:
-    """Finds no module. Python asks it first for each part that pyopencl imports after setting PYOPENCL_HOME."""
+    """An import hook that finds no module, but sets PYOPENCL_HOME anew.
+
+    Python calls it for each part of pyopencl that is imported, which is after pyopencl has set the variable.
+    """
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
@@ -27,6 +30,6 @@ class _Hider:
 
 
 if os.environ.get(WITHOUT):
-    sys.meta_path.insert(0, _Hider)  # a finder needs no other method
+    sys.meta_path.insert(0, _Hider)  # the class itself, as Python calls only `find_spec`
 if os.environ.get(INTERPRETER):
     sys.executable = os.environ[INTERPRETER]
