@@ -132,8 +132,8 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);
 #endif
 
-// Processes a pair in the cells that it reaches. A work-item with many cells runs three short loops instead of one,
-// because short dependency chains and few registers keep more cells in flight (docs/performance.md).
+// Processes a pair in the cells that it reaches. With 8 lanes or more a work-item runs three short loops, not one, as
+// short dependency chains and few registers keep more cells in flight (docs/performance.md).
 #if LANES >= 8 && !defined(RAYS)
 #define TAKE_PAIR(reach)                                                                                               \
   floatL alpha_of[CELLS], u_of[CELLS], g_of[CELLS], weight_of[CELLS];                                                  \

@@ -12,7 +12,8 @@
 //     groups.
 //   Parameters and both moments (model_rows rows): updated up to step `step`.
 //   readback (READBACK_SIZE): counts refusals. After a stopped pass (duplicate.cl) nothing changes.
-//   The other scalars are fields of Step (shared/adam.h).
+//   sh_width: floats of sh_rest in a row. limit2_sh: the field `limit2` of Step for sh_dc and sh_rest;
+//   limit2: for the other groups. The other scalars are fields of Step (shared/adam.h).
 // Equations: docs/gradients.md, (42); (193) tells when a parameter no longer changes, so that further steps only
 //   multiply its moments.
 #include "shared/math.h"

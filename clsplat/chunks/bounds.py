@@ -61,7 +61,7 @@ class ChunkBounds:
 
     @cached_property
     def finite(self) -> Bool:
-        """True (B,) for chunks with finite bounds."""
+        """Array (B,): True for chunks with finite bounds."""
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray(np.isfinite(self.lowest.sum(axis=1) + self.highest.sum(axis=1) + self.largest))
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flags of a verb, read from its dataclass: grouped help, and suggestions for misspelt flags."""
+"""Flags of a verb, read from its dataclass: grouped help, and suggestions for misspelt flags.
+
+tyro makes and parses the flags themselves (`parse` in `clsplat/cli/parsing.py`); the names here are those of tyro.
+"""
 
 from __future__ import annotations
 

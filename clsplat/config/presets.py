@@ -122,11 +122,14 @@ def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collect
 def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:
     """Return the training settings of a preset and a schedule, which flags of `clsplat train` may override.
 
-    fast trains less. Photographs have a quarter of their width and height for the first 1/14 of the steps, and half
-    until 2/7 of the steps. There are fewer Gaussians: splits are along the longest axis, and Gaussians that add less
-    than a tenth of a pixel to every view are pruned. The rates come from the short schedule, with means, scales and
-    rotations up to four times higher. The higher SH bands are updated in every second step
-    (docs/decisions/0015-the-fast-preset.md).
+    schedule: None means short for fast, and paper for the other presets.
+
+    fast saves time by less work in a step. Photographs have a quarter of their width and height for the first 1/14 of
+    the steps, and half until 2/7 of the steps. There are fewer Gaussians: the gradient threshold is higher, splits are
+    along the longest axis, and Gaussians that add less than a tenth of a pixel to every view are pruned. Means, scales
+    and rotations have two to four times the schedule's rates. The higher SH bands are updated in every second step. The
+    rasterizer has the approximations of RASTERIZER_PRESETS (docs/decisions/0015-the-fast-preset.md).
+
     Raises InputError for fast with high-rates.
     """
     if preset == "fast" and schedule == "high-rates":

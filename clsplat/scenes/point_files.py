@@ -168,7 +168,7 @@ def _warn_of_left_out(path: Path, good: NDArray[np.bool_]) -> None:
     if good.all():
         return
     bad = int(np.count_nonzero(~good))
-    found = f"{path}: {bad:,} of {len(good):,} points have a position or colour that is not finite"
+    found = f"{path}: {bad:,} of {len(good):,} points have values that are not finite"
     if bad == len(good):
         raise InputError(f"{found}, expected some finite points")
     warn(f"{found}, and are left out")

@@ -35,6 +35,7 @@ the larger histograms cost.
 
 
 def _widest_digit(device: Device, n: int) -> int:
+    """Return the bits of a digit in the passes over `n` keys. `Shape.digit_bits`: `device/drivers/shapes.py`."""
     return WIDE_DIGIT_BITS if device.shape.items == 1 and n >= MIN_WIDE_DIGIT_KEYS else device.shape.digit_bits
 
 

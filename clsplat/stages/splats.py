@@ -134,7 +134,7 @@ def splats_grad(
 def add_values(
     device: Device, projected: Projected, slots: Slots, d_values: DeviceArray, first: int, count: int
 ) -> None:
-    """Sum the slots of each Gaussian into columns of d_values (n, width).
+    """Write the sums of each Gaussian's slots to columns of d_values (n, width).
 
     slots: (pairs, count), gradients with respect to `count` values.
     first: the first of the `count` columns.

@@ -109,9 +109,11 @@ class Forecast:
         return pace * float(sum(span.steps * (cost @ np.array(self._amounts(span))) for span in ahead))
 
     def _reads(self, before: int, step: int) -> float:
-        """Number of photographs that the steps after `before` up to `step` read. A photograph is read at its first use.
+        """Expected number of photographs that the steps after `before` up to `step` read. A photograph is read at its
+        first use.
 
-        Each epoch shows every photograph once, in a random order, and a training may resume in the middle of one.
+        Each epoch shows every photograph once, in an order that is taken as random. A training may resume in the middle
+        of an epoch.
         """
         assert self.begun is not None
         begin = self.begun[0] - 1

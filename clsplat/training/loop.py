@@ -218,7 +218,7 @@ class TrainingSession:
             warnings.warn(f"{untold} more steps had values that were not finite")
 
     def give_up(self) -> None:
-        """Write a bundle, by which the non-finite values can be reproduced, and raise ClsplatError."""
+        """Raise ClsplatError. Before that, write a bundle that reproduces the non-finite values to the run, if any."""
         incident = self.trainer.monitor.latest
         assert incident is not None, "retries are used up only by steps with non-finite values"
         trouble = (

@@ -319,8 +319,10 @@ class TrainedModel:
         self._use(pool or make(), move.coefficients)
 
     def _move_chunks(self, move: Move) -> None:
-        """Move the rows of a model in a store of chunks. The store moves to a scratch file if main memory has no room
-        for it any longer."""
+        """Move the rows of a model in a store of chunks.
+
+        The model leaves the store if it no longer has to be streamed or has become small. The store moves to a scratch
+        file if main memory has no room for it any longer."""
         assert self._pool is not None
         count, store = move.count(self.parameters.count), self._pool.store
         to_file = store.path is None and self._scratch(self._record_bytes(move.coefficients) * count) is not None

@@ -114,8 +114,8 @@ static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coef
   return colour;
 }
 
-// True if all channels are below COLOUR_LIMIT, and so finite. A single pixel with a channel above it would dominate the
-// loss.
+// True if all channels are below COLOUR_LIMIT, and none is NaN. A single pixel with a channel above the limit would
+// dominate the loss. `store_colour` clamps negative channels to 0.
 static inline int colour_is_drawn(float4 colour) {
   return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
 }

@@ -117,7 +117,7 @@ def test_points_that_are_no_numbers_are_left_out(kind: str, tmp_path: Path) -> N
     xyz, rgb = XYZ.copy(), RGB / 255
     (xyz if kind == "position" else rgb)[5, 1] = np.nan
     write_cloud(tmp_path / "a.ply", xyz, rgb, "float")
-    with pytest.warns(UserWarning, match="1 of 60 points have a position or colour that is not finite, and are left"):
+    with pytest.warns(UserWarning, match="1 of 60 points have values that are not finite, and are left"):
         found, colours = read_point_cloud(tmp_path / "a.ply")
     np.testing.assert_array_equal(found, np.delete(XYZ, 5, axis=0).astype(np.float32))
     np.testing.assert_allclose(colours, np.delete(RGB, 5, axis=0) / 255, atol=1e-6)

@@ -250,7 +250,7 @@ def test_point_clouds(tmp_path: Path) -> None:
     path.write_bytes(head + points.astype(">f8").tobytes()[:-1])
     refuses(r"a\.ply: truncated", read_point_cloud, path)
     path.write_bytes(head + np.full((3, 3), np.nan, ">f8").tobytes())
-    refuses("3 of 3 points have a position or colour that is not finite", read_point_cloud, path)
+    refuses("3 of 3 points have values that are not finite", read_point_cloud, path)
 
 
 def test_ngps_volume(tmp_path: Path) -> None:

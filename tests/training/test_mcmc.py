@@ -193,7 +193,7 @@ def test_gradients_are_gathered_as_long_as_it_grows() -> None:
 def test_nothing_alive_stops_it(scene: Scene, default_device: Device) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.parameters["opacity_logits"].fill(-9.0)
-    with pytest.raises(ClsplatError, match=r"every Gaussian is under --density\.min-opacity 0\.03"):
+    with pytest.raises(ClsplatError, match=r"every Gaussian is dead: under --density\.min-opacity 0\.03"):
         trainer.strategy.before_step(trainer._state(15))
 
 

@@ -204,8 +204,7 @@ def report_planted(result: Result, check: str) -> bool:
 
 
 def report_builds(builds: Mapping[tuple[str, str], set[str]], kernels: set[str]) -> bool:
-    """Print the kernels that never ran, and the builds that the short form would leave out. Returns True if there are
-    none.
+    """Print the kernels that never ran, and the builds that --short would leave out. Returns True if there are none.
 
     builds: sets of "SHAPE KERNEL@BUILD" that ran, keyed by check and form. The form is "short" for parts that run with
         --short, "whole" for parts that it leaves out.

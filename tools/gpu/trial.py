@@ -152,7 +152,7 @@ class Trial:
         self.add("left_out", {"what": what, "why": why})
 
     def attempt(self, what: str, work: Callable[[], None]) -> None:
-        """Do a piece of work if there is time; note why it is left out if it fails."""
+        """Do a piece of work. If no time is left or it fails, note why it is left out."""
         if self.left <= 0:
             self.leave_out(what, "no time was left")
             return

@@ -3,6 +3,7 @@
 
 With CLSPLAT_PRETEND any machine can test the code paths for GPUs, for small devices and for simple compilers.
 Whether arrays are shared with the host follows from the kind: `Device.shares_memory` of `clsplat/device/context.py`.
+Sub-groups: `subgroup_ways` of `quirks.py`, tried by `Device.kernels`.
 """
 
 from __future__ import annotations

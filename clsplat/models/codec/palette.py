@@ -63,6 +63,7 @@ def palette(
     """Return a palette that approximates `vectors` (n, d), and for each vector the index (n,) of its palette entry.
 
     The palette has shape (size, d), or (n, d) if there are fewer vectors than `size`.
+    Rows that no vector refers to may be 0.
 
     The method is k-means on two levels. The first level divides the vectors into clusters. The second divides each
     cluster further, and each part gives an entry of the palette. The larger a cluster and its squared error, the more

@@ -300,7 +300,11 @@ def _plain(listed: str) -> str:
 
 
 def _find_file(keys: Keys) -> Path:
-    """Return the path of a frame's picture, with the extension that the file may omit; else the listed path."""
+    """Return the path of a frame's picture.
+
+    If `file_path` lacks the extension, the first known one is added for which a file exists. If none exists, the path
+    is returned as listed.
+    """
     path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path

@@ -69,7 +69,7 @@ def settings_of_whole_steps(config: TrainConfig) -> list[str]:
 
 
 def runs_by_chunk(config: TrainConfig, device: Device) -> bool:
-    """True if a step may run over the chunks in view."""
+    """True if a step may run over the chunks in view alone, instead of the whole model."""
     return not settings_of_whole_steps(config) and device.max_group >= DEFAULT_GROUP_ITEMS
 
 
