@@ -66,8 +66,8 @@ class Mcmc(Strategy):
             dead |= model.statistics["radii"].get() > config.max_screen_radius
         if dead.all():
             raise ClsplatError(
-                f"step {model.step}: every Gaussian is dead: under --density.min-opacity {config.min_opacity}, without a "
-                "rotation, or larger than --density.max-screen-radius; lower --density.min-opacity or "
+                f"step {model.step}: every Gaussian is dead: under --density.min-opacity {config.min_opacity}, without "
+                "a rotation, or larger than --density.max-screen-radius; lower --density.min-opacity or "
                 "--density.opacity-weight"
             )
         more, places = wanted(config, model.step, model.count) - model.count, np.flatnonzero(dead)
