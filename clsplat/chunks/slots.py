@@ -13,8 +13,8 @@ NO_SLOT = -1
 """Slot number of a chunk that has not been written. Each field of this chunk has one value in all its elements
 (`manifest.CONSTANTS`)."""
 MAX_TENTHS = 22
-"""Maximum number of slots of a file, in tenths of the number of chunks. 22 allow two copies of each chunk, one for the
-latest checkpoint and one that later steps change, and a tenth more."""
+"""Number of slots beyond which old checkpoints are removed before a file grows, in tenths of the number of chunks. 22
+allow two copies of each chunk, one for the latest checkpoint and one that later steps change, and a tenth more."""
 _GROWTH_SHARE = 16
 """The number of chunks divided by this is the smallest number of slots by which a file grows."""
 
@@ -35,7 +35,7 @@ class SlotTable:
 
     @property
     def most(self) -> int:
-        """Maximum number of slots. Before the file gets more slots, old checkpoints are removed."""
+        """Number of slots beyond which the file grows only after old checkpoints have been removed."""
         return max(MAX_TENTHS * len(self.current) // 10, 1)
 
     @property

@@ -194,7 +194,8 @@ class Renderer:
         Raises
         ------
         InputError
-            If the cameras of motion have different projections, or the camera is a fisheye with coefficients.
+            If `wanted` has motion or backward, and the other camera has another projection or `camera` is a fisheye
+            with coefficients.
         ValueError
             If the number of moved Gaussians differs.
         """

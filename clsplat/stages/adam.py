@@ -46,7 +46,8 @@ class AdamStep:
 
     @property
     def scales(self) -> dict[str, float]:
-        """Step sizes by parameter group that the step updates: rate * sqrt(1 - beta2^t) / (1 - beta1^t)."""
+        """Step size of each parameter group in its t-th update: rate * sqrt(1 - beta2^t) / (1 - beta1^t). Groups that
+        this step does not update are left out."""
         groups = [group for group in self.rates if group != "sh_rest" or self.updates_sh_rest]
         by_group = {group: self.corrected(group) for group in groups}
         return {group: rate / root for group, (rate, root) in by_group.items()}

@@ -13,7 +13,7 @@ _RATE_SETTINGS = {name: group.rate for name, group in PARAMETER_GROUPS.items()}
 
 
 def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) -> dict[str, float]:
-    """Learning rate of each parameter group at a step.
+    """Learning rate of each parameter group at a step. Batches scale them: `scaled_rates` of `training/batch.py`.
 
     The means' rate changes exponentially, and is relative to the scene's length unit. All rates fall in the cooldown.
     factor: factor on all rates, smaller after each return to a checkpoint (`RetryBudget.rate_factor`).

@@ -165,20 +165,21 @@ typedef uint Open;
 
 #define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
 
-// Records of cells, which blend.cl writes for blend_grad.cl. A record has a bit for each vector of the shape's width,
-// and a cell consists of VECTORS vectors. RECORDED(mask) << FIRST_RECORDED(cell): the bits of those vectors of a cell
-// that have a lane set in `mask`. CELLS_OF(recorded): the cells of the recorded vectors. PLACE_OF(each): the index of a
-// recorded vector in an array of cells, taken as an array of floatS.
+// Records of cells, which blend.cl writes for blend_grad.cl. A cell is one vector of the shape's width, or two that
+// widened.h has combined (VECTORS); a record has a bit for each of these vectors. RECORDED(mask) <<
+// FIRST_RECORDED(cell): the bits of a cell's vectors that have a lane set in `mask`. CELLS_OF(recorded): the cells that
+// the set bits belong to. PLACE_OF(bit): the index of the vector with this bit, if an array of cells is read as an
+// array of vectors (floatS).
 #if VECTORS == 1
 #define FIRST_RECORDED(cell) (cell)
 #define RECORDED(mask) ((uint)(ANYL(mask) != 0))
 #define CELLS_OF(recorded) (recorded)
-#define PLACE_OF(each) (each)
+#define PLACE_OF(bit) (bit)
 #else // two vectors, one below the other
 #define FIRST_RECORDED(cell) ((cell) / COLUMNS * (2 * COLUMNS) + (cell) % COLUMNS)
 #define RECORDED(mask) recorded_of(mask)
 #define CELLS_OF(recorded) cells_of(recorded)
-#define PLACE_OF(each) place_of[each]
+#define PLACE_OF(bit) place_of[bit]
 __constant uchar place_of[2 * CELLS] = {0,  2,  4,  6,  1,  3,  5,  7,  8,  10, 12, 14, 9,  11, 13, 15,
                                         16, 18, 20, 22, 17, 19, 21, 23, 24, 26, 28, 30, 25, 27, 29, 31};
 static inline uint recorded_of(intL mask) {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compute how often loops over Gaussians' tiles and over lists run, from a frame's boxes and lengths of lists."""
+"""Compute how often the loops over a Gaussian's tiles and over a tile's list run, from boxes and lengths of lists."""
 
 from __future__ import annotations
 

@@ -250,7 +250,9 @@ def all_finite(array: NDArray[Any]) -> bool:
 
 
 def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0, first: int = 0) -> None:
-    """Check Gaussians before they are written to `path`. first: index in the file of the first, for messages.
+    """Check Gaussians before they are written to `path`.
+
+    first: the index in the file of the first of these Gaussians, for messages.
 
     Raises ValueError for invalid arrays (`Gaussians.check`), InputError for non-finite values and for fewer than
     `least` Gaussians.

@@ -447,7 +447,7 @@ def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64,
         raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN_ADVICE}")
     matrix = numbers(given)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_COORDINATE).all():
-        raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
+        raise InputError(f"{where}: {what} is {short(given)}, expected 3 x 4 or 4 x 4 finite numbers")
     # If the camera object was scaled, its scale is in the matrix. Poses have no scale.
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = float(np.cbrt(determinant))

@@ -42,7 +42,7 @@ class Settings:
     unapplied: tuple[str, ...] = ()
 
     def aspect(self, aperture: tuple[float, float]) -> float:
-        """Return the ratio of width to height of a picture in pixels, if the user gives only one of them.
+        """Return width / height of a picture in pixels. It gives the missing side if the user gives only one side.
 
         aperture: width and height of the camera's aperture.
         """
