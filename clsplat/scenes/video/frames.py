@@ -208,7 +208,7 @@ def _size(path: Path) -> int:
 def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress: Progress) -> dict[str, Any]:
     """Write the chosen frames of one video below `folder`. Returns the video's part of the table."""
     with open_video(path) as reader:
-        measured, numbers, turns = _measured(reader, lambda done: progress(f"reading {name}", done))
+        measured, numbers, turns = measure_video(reader, lambda done: progress(f"reading {name}", done))
         facts = reader.facts
         _check(path, reader, measured)
     choice = choose(measured, count)
@@ -227,7 +227,7 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
     return {**_described(facts, turns), **_listed(folder, files, measured, choice, numbers), **_told(told)}
 
 
-def _measured(reader: VideoReader, report: Callable[[float], None]) -> tuple[Measurements, list[int], int]:
+def measure_video(reader: VideoReader, report: Callable[[float], None]) -> tuple[Measurements, list[int], int]:
     """Measure all frames. Returns the measurements, the number of each measured frame, and the frames' quarter turns.
 
     Frames of another size than the first one's are left out.

@@ -27,6 +27,8 @@ SD_HEIGHT_PX = 576
 """Largest height in pixels of a video whose colours are Rec.601 if the file does not name a matrix."""
 MIN_VIDEO_SIDE_PX = 32
 """Smallest side in pixels of a video whose motion can be measured."""
+MAX_VIDEO_PIXELS = 1 << 27
+"""Largest number of pixels of a video's frame: 16384 x 8192. A decoder keeps several frames in memory."""
 
 _ISO6709 = re.compile(r"([+-]\d+(?:\.\d*)?)([+-]\d+(?:\.\d*)?)([+-]\d+(?:\.\d*)?)?(?:CRS[^/]*)?/?\s*\Z")
 _PLACE_KEYS = ("com.apple.quicktime.location.ISO6709", "location", "location-eng")
@@ -167,6 +169,10 @@ def _prepared(path: Path, stream: Any) -> Any:
         raise InputError(
             f"{path}: its pictures are {context.width}x{context.height}, expected at least {MIN_VIDEO_SIDE_PX} pixels "
             "a side"
+        )
+    if context.width * context.height > MAX_VIDEO_PIXELS:
+        raise InputError(
+            f"{path}: its pictures are {context.width}x{context.height}, expected at most {MAX_VIDEO_PIXELS:,} pixels"
         )
     context.thread_type = "AUTO"
     return stream
