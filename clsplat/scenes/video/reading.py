@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ def is_video_name(path: Path) -> bool:
 class VideoFacts:
     """Facts from the header of a video.
 
-    width, height: size in pixels as stored, before the rotation that the file asks for.
+    width, height: size in pixels, as stored or as `turned` says.
     seconds: length by the header; None if the header does not have it.
     frames: number of frames by the header; 0 if the header does not have it.
     codec: FFmpeg's name of the codec.
@@ -66,6 +66,12 @@ class VideoFacts:
     time: str = ""
     make: str = ""
     model: str = ""
+
+    def turned(self, quarter_turns: int) -> VideoFacts:
+        """Return the facts with the size of the picture after quarter turns."""
+        if quarter_turns % 2 == 0:
+            return self
+        return replace(self, width=self.height, height=self.width)
 
 
 @dataclass(frozen=True, eq=False)
