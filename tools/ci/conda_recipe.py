@@ -107,7 +107,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--run", action="store_true", help="run the test commands in this environment")
     asked = parser.parse_args(arguments)
     found = problems(RECIPE, ROOT)
-    print("\n".join(found) or f"{RECIPE.relative_to(ROOT)}: valid for {', '.join(SYSTEMS)}, with the wheel's requirements")
+    print(
+        "\n".join(found) or f"{RECIPE.relative_to(ROOT)}: valid for {', '.join(SYSTEMS)}, with the wheel's requirements"
+    )
     if found or not asked.run:
         return 1 if found else 0
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds the sdist and the wheel, compares them with git's files, and tries each in an empty environment.
 
-`tools/release --build` runs this in the checkout's environment with the extra `release`.
+`tools/release --build` runs this in the checkout's environment with the extra `release`. To try built files, any Python
+without further packages is enough:
+
+    python3.13 tools/ci/release_build.py dist/clsplat-0.1.0*
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ import tempfile
 import time
 import zipfile
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from environment import python_of
 from release_checks import bundled, named, project
@@ -62,7 +67,11 @@ def differences(title: str, found: set[str], expected: set[str]) -> list[str]:
     missing, more = sorted(expected - found), sorted(found - expected)
     return [
         *([f"{title}: without {named(missing)}, which git has"] if missing else []),
-        *([f"{title}: with {named(more)}, which git does not have; remove what the build must not take"] if more else []),
+        *(
+            [f"{title}: with {named(more)}, which git does not have; remove what the build must not take"]
+            if more
+            else []
+        ),
     ]
 
 
@@ -83,7 +92,9 @@ def check_contents(root: Path, sdist: Path, wheel: Path) -> None:
     problems = content_problems(root, sdist, wheel)
     if problems:
         sys.exit("\n".join(f"tools/release: {problem}" for problem in problems))
-    print(f"contents   {len(bundled(root))} files of git in the sdist, {len(wheel_names(wheel))} in the wheel", flush=True)
+    print(
+        f"contents   {len(bundled(root))} files of git in the sdist, {len(wheel_names(wheel))} in the wheel", flush=True
+    )
     for module, words in CONTENT_CHECKS.items():
         files = [str(wheel)] if module == "check_wheel_contents" else [str(sdist), str(wheel)]
         _run([sys.executable, "-m", module, *words, *files], root)
@@ -137,3 +148,10 @@ def _run(command: list[str], folder: Path) -> None:
 
 def _output(command: list[str]) -> str:
     return subprocess.run(command, env=_environment(), capture_output=True, text=True, check=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    for argument in sys.argv[1:]:
+        if not Path(argument).is_file():
+            sys.exit(f"release_build.py: {argument}: no such file, expected an sdist or a wheel of dist/")
+        print(try_out(Path(argument).resolve(), sys.executable), flush=True)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a commit needs to be released: one version everywhere, its tag, its section of the changelog, a clean tree, and a
-licence for each file that the wheel or the sdist holds. `tools/release --check` prints the findings."""
+"""Checks of a commit that is to be released: version, tag, changelog, clean tree, and a licence for each file of the wheel
+and of the sdist. `tools/release --check` prints the findings."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def install_problem(root: Path) -> str:
         text = (root / name).read_text("utf-8")
         for before, after in lines.items():
             if before in text or after not in text:
-                return f"{name}: no line {after.strip()!r}; tools/release --prepare changes the lines about installing"
+                return f"{name}: no line {after.strip()}; tools/release --prepare changes the lines about installing"
     return ""
 
 
@@ -128,7 +128,9 @@ def tag_problem(root: Path, version: str) -> str:
     """The commit has the version's tag and no other version's."""
     tags = _git(root, "tag", "--points-at", "HEAD", "--list", "v*").split()
     if not tags:
-        return f"no tag at this commit, expected v{version}: git tag --annotate v{version} --message 'clsplat {version}'"
+        return (
+            f"no tag at this commit, expected v{version}: git tag --annotate v{version} --message 'clsplat {version}'"
+        )
     wrong = [tag for tag in tags if tag != f"v{version}"]
     return f"tag {named(wrong)} at this commit, but pyproject.toml has version {version}" if wrong else ""
 
@@ -213,5 +215,7 @@ def _git(root: Path, *arguments: str) -> str:
     command = ["git", "-C", str(root), *arguments]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode != 0:
-        sys.exit(f"tools/release: git {arguments[0]} failed in {root}: {result.stderr.strip()}; expected a git checkout")
+        sys.exit(
+            f"tools/release: git {arguments[0]} failed in {root}: {result.stderr.strip()}; expected a git checkout"
+        )
     return result.stdout

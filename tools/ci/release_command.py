@@ -4,16 +4,13 @@
 from __future__ import annotations
 
 import argparse
-import datetime
+import datetime as dt
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for environment.py
-
+from conda_recipe import write_recipe
 from release_build import build, check_contents, interpreters, try_out
 from release_checks import findings, prepare
-
-from conda_recipe import write_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,7 +34,7 @@ def main(arguments: list[str]) -> int:
     )
     asked = parser.parse_args(arguments)
     if asked.prepare:
-        today = datetime.datetime.now(tz=datetime.timezone.utc).date().isoformat()
+        today = dt.datetime.now(tz=dt.timezone.utc).date().isoformat()
         changed = prepare(ROOT, today)
         print(f"changed: {', '.join(changed)}; look at them and commit" if changed else "nothing to change")
         return 0
