@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Docker files, as `docker_lines.py` reads them. Running their lines in Debian roots takes minutes, and is no test."""
+"""The Docker files, as `docker_lines.py` reads them. To run their lines in Debian roots takes minutes: no test does."""
 
 from __future__ import annotations
 

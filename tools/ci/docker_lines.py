@@ -34,8 +34,9 @@ OF_HOST = ("etc/resolv.conf", "etc/hosts")
 CERTIFICATES = "host-certificates.crt"
 """Name in a root of the file that PIP_CERT names on this machine; Debian's own certificates stay as they are."""
 KNOWN = {"FROM", "RUN", "COPY", "ENV", "WORKDIR", "ENTRYPOINT", "CMD"}
-IN_ROOT = 'mount --rbind /proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot "$0" /bin/sh -c "$1"'
-"""Shell commands that run a command in a root, with the machine's /proc and /dev mounted for its duration."""
+IN_ROOT = """for folder in proc sys dev; do mount --rbind /$folder "$0/$folder" || exit; done
+exec chroot "$0" /bin/sh -c "$1\""""
+"""Shell commands that run a command in a root, with this machine's /proc, /sys and /dev mounted while it runs."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ class Image:
 
 def lines_of(text: str) -> Iterator[Line]:
     """The instructions of a Docker file, without comments."""
-    begun, parts = 0, []
+    begun = 0
+    parts: list[str] = []
     for number, row in enumerate(text.splitlines(), 1):
         if row.lstrip().startswith("#") or not row.strip():
             continue

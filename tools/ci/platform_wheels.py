@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Whether every package that clsplat needs has a wheel, for each system and Python that clsplat supports.
+"""Check that every package that clsplat needs has a wheel, for each system and Python that clsplat supports.
 
     .venv/bin/python tools/ci/platform_wheels.py                     # all systems of SYSTEM_TAGS, all Pythons
     .venv/bin/python tools/ci/platform_wheels.py --python 3.12 --extra video
 
 uv resolves the requirements of pyproject.toml with the markers of the system asked about. Then pip, which evaluates
-markers for this system only, has to find a wheel of each package in the version that uv chose. Needs the extra `release`.
+markers for this system only, has to find a wheel of each package in the version that uv chose. Needs the extra
+`release`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a commit that is to be released: version, tag, changelog, clean tree, and a licence for each file of the wheel
-and of the sdist. `tools/release --check` prints the findings."""
+"""Checks of a commit that is to be released: version, tag, changelog, clean tree, and a licence for each file of the
+wheel and of the sdist. `tools/release --check` prints the findings."""
 
 from __future__ import annotations
 
