@@ -44,15 +44,15 @@ def rendered(path: Path, system: str) -> dict[str, Any]:
 
 
 def run_requirements(document: dict[str, Any]) -> dict[str, str]:
-    """Versions by package that a rendered recipe asks for, without Python and without marks of systems."""
+    """Version ranges that a rendered recipe requires, by package, without Python and conda's virtual packages."""
     pairs = [str(entry).partition(" ")[::2] for entry in document["requirements"]["run"]]
     return {name: versions for name, versions in pairs if name != "python" and not name.startswith("__")}
 
 
 def wheel_requirements(root: Path, system: str) -> dict[str, str]:
-    """Versions by package, under conda-forge's names, that the wheel's requirements come to on a system.
+    """Version ranges that the wheel requires on a system, by package under conda-forge's name.
 
-    tomli is asked for whatever Python's version, as a noarch package has no marker of it.
+    tomli is among them for every Python, because a noarch package cannot depend on Python's version.
     """
     from packaging.requirements import Requirement
 
