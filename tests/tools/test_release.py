@@ -219,14 +219,7 @@ def test_files_that_differ_from_gits_are_named(tmp_path: Path) -> None:
     ]
 
 
-def test_an_interpreter_that_is_not_there_is_told() -> None:
-    with pytest.raises(
-        SystemExit, match=r"--python nothing-here: no such program, expected a Python such as python3.12"
-    ):
-        release_build.interpreters(["nothing-here"])
-
-
-@pytest.mark.parametrize("arguments", [[], ["--check", "--build"], ["--publish"]])
+@pytest.mark.parametrize("arguments", [[], ["--check", "--build"], ["--publish"], ["--build", "--python", "nothing"]])
 def test_other_arguments_are_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         release_command.main(arguments)

@@ -76,14 +76,14 @@ def lines_of(text: str) -> Iterator[Line]:
 
 
 def base_of(path: Path) -> str:
-    """The Debian release of the line FROM. Exits with a message if a line is of a kind that this tool does not run."""
+    """The Debian release of the line FROM. Raises ValueError at a line of a kind that this tool does not run."""
     lines = list(lines_of(path.read_text("utf-8")))
     for line in lines:
         if line.keyword not in KNOWN:
-            sys.exit(f"{path}:{line.number}: {line.keyword}, expected one of {', '.join(sorted(KNOWN))}")
+            raise ValueError(f"{path}:{line.number}: {line.keyword}, expected one of {', '.join(sorted(KNOWN))}")
     found = IMAGE.fullmatch(lines[0].text) if lines and lines[0].keyword == "FROM" else None
     if found is None:
-        sys.exit(f"{path}: the first line is not FROM debian:RELEASE or debian:RELEASE-slim")
+        raise ValueError(f"{path}: the first line is not FROM debian:RELEASE or debian:RELEASE-slim")
     return found[1]
 
 
@@ -178,8 +178,11 @@ def main(arguments: list[str]) -> int:
     asked = parser.parse_args(arguments)
     for path in asked.files:
         if not path.is_file():
-            sys.exit(f"{path}: no such file, expected a Docker file such as packaging/docker/cpu.Dockerfile")
-        base_of(path)
+            parser.error(f"{path}: no such file, expected a Docker file such as packaging/docker/cpu.Dockerfile")
+        try:
+            base_of(path)
+        except ValueError as error:
+            parser.error(str(error))
     if sys.platform != "linux" or os.geteuid() != 0 or not shutil.which("debootstrap"):
         sys.exit("docker_lines.py: expected root on Linux, with debootstrap (apt install debootstrap)")
     asked.roots.mkdir(parents=True, exist_ok=True)

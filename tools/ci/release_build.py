@@ -9,6 +9,7 @@ without further packages is enough:
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import os
 import shutil
@@ -127,10 +128,10 @@ def try_out(package: Path, python: str) -> str:
 
 
 def interpreters(asked: list[str]) -> list[str]:
-    """Paths of the interpreters. Exits if one cannot be run."""
+    """The interpreters that are asked for, or this one. Raises ValueError if there is no such program."""
     for name in asked:
         if shutil.which(name) is None:
-            sys.exit(f"tools/release: --python {name}: no such program, expected a Python such as python3.12")
+            raise ValueError(f"--python {name}: no such program, expected a Python such as python3.12")
     return asked or [sys.executable]
 
 
@@ -151,7 +152,9 @@ def _output(command: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    for argument in sys.argv[1:]:
-        if not Path(argument).is_file():
-            sys.exit(f"release_build.py: {argument}: no such file, expected an sdist or a wheel of dist/")
-        print(try_out(Path(argument).resolve(), sys.executable), flush=True)
+    parser = argparse.ArgumentParser(description="Install built files into empty environments, and run the demo.")
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="an sdist or a wheel")
+    for file in parser.parse_args().files:
+        if not file.is_file():
+            parser.error(f"{file}: no such file, expected an sdist or a wheel of dist/")
+        print(try_out(file.resolve(), sys.executable), flush=True)

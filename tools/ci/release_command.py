@@ -38,7 +38,13 @@ def main(arguments: list[str]) -> int:
         changed = prepare(ROOT, today)
         print(f"changed: {', '.join(changed)}; look at them and commit" if changed else "nothing to change")
         return 0
-    return _check() if asked.check else _build(asked.output.resolve(), interpreters(asked.python))
+    if asked.check:
+        return _check()
+    try:
+        pythons = interpreters(asked.python)
+    except ValueError as error:
+        parser.error(str(error))
+    return _build(asked.output.resolve(), pythons)
 
 
 def _check() -> int:
