@@ -62,6 +62,7 @@ NEEDS = {
     "chromium": Need("Chromium", "apt-get install chromium, or set CLSPLAT_CHROMIUM", lambda: bool(chromium_path())),
     "distributed": of_extra("distributed", "distributed", "farm"),
     "ffmpeg": Need("FFmpeg", "apt-get install ffmpeg", lambda: shutil.which("ffmpeg") is not None),
+    "git": Need("git", "apt-get install git", lambda: shutil.which("git") is not None),
     "gsplat": Need("gsplat", "pip install --no-deps gsplat==1.5.3", lambda: find_spec("gsplat") is not None),
     "hatchling": of_extra("hatchling", "hatchling", "test"),
     "importlinter": of_extra("importlinter", "import-linter", "dev"),
@@ -77,7 +78,9 @@ NEEDS = {
     "openjd": Need("openjd-cli", "python3 tools/environment.py dev", lambda: bool(openjd_path())),
     "playwright": of_extra("playwright", "Playwright", "test"),
     "pxr": of_extra("pxr", "OpenUSD", "usd"),
+    "rattler_build": of_extra("rattler_build", "py-rattler-build", "release"),
     "scenes": Need("real scenes", "set CLSPLAT_SCENES to their folder", SCENES.is_dir),
+    "tree_sitter_powershell": of_extra("tree_sitter_powershell", "tree-sitter-powershell", "release"),
     "torch": of_extra("torch", "PyTorch", "torch"),
     "viser": of_extra("viser", "viser", "view"),
 }
