@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 from measuring import number, plain_parser
-from OpenImageIO import ImageInput
 from walk_videos import Walk, walk, write_walk
 
+from clsplat.images.reading import read_image
 from clsplat.progress import aligned
 from clsplat.scenes.video.choice import choose
 from clsplat.scenes.video.frames import TakenFrames, measure_video, take_frames
@@ -73,8 +73,8 @@ def error(made: Walk, taken: TakenFrames) -> float:
     """Mean absolute difference between written and rendered frames, in levels of 255."""
     differences = []
     for name in taken.names:
-        pixels = ImageInput.open(str(taken.folder / name)).read_image("uint8").astype(np.float32)
-        differences.append(np.abs(pixels - 255 * made.frames[int(Path(name).stem)]).mean())
+        written = read_image(taken.folder / name)
+        differences.append(255 * np.abs(written - made.frames[int(Path(name).stem)]).mean())
     return float(np.mean(differences))
 
 

@@ -29,6 +29,7 @@ from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
+from clsplat.scenes.video.reading import is_video_name
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 
@@ -142,7 +143,8 @@ def reconstruct(
     _require_enough(images, len(paths) + len(videos.paths))
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
-        warn(f"{images}: {_listed(names)} left out: {why}")
+        kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
+        warn(f"{images}: {_listed(names, kind)} left out: {why}")
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -236,12 +238,13 @@ def sfm_task(
     work: folder for the photographs, masks and intermediate files.
     """
     many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
+    names = {photo.name for photo in photos}
     return {
         "masks": masked,
         "photos": str(work / "photos"),
         "work": str(work),
         "groups": sfm_photos.camera_groups(photos, settings.shared_camera),
-        "sequences": sequences,
+        "sequences": [[name for name in frames if name in names] for frames in sequences],
         "sequential": settings.matching == "sequential" or (settings.matching == "auto" and many),
         "camera_model": settings.camera_model,
         "max_image_size": settings.max_image_size,
@@ -453,6 +456,6 @@ def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     )
 
 
-def _listed(names: list[str]) -> str:
+def _listed(names: list[str], kind: str = "photo(s)") -> str:
     """Return text such as "3 photo(s) (a.jpg, b.jpg, c.jpg)", shortened if there are many names."""
-    return f"{len(names):,} photo(s) ({examples(names)})"
+    return f"{len(names):,} {kind} ({examples(names)})"
