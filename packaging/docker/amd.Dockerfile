@@ -6,6 +6,8 @@ FROM debian:trixie-slim
 RUN apt-get update \
     && apt-get install -y --no-install-recommends mesa-opencl-icd python3-venv \
     && rm -rf /var/lib/apt/lists/*
+# the package has Mesa's older driver, Clover, too, which would list each card a second time
+RUN rm /etc/OpenCL/vendors/mesa.icd
 COPY dist/clsplat-*.whl /tmp/
 RUN python3 -m venv /opt/clsplat \
     && /opt/clsplat/bin/pip install --no-cache-dir /tmp/clsplat-*.whl \
