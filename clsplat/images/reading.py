@@ -23,8 +23,8 @@ from clsplat.errors import InputError, examples, reason_of
 from clsplat.files.documents import is_file, open_input
 from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
-from clsplat.images.orientation import turned
-from clsplat.images.photo_decoders import (
+from clsplat.images.decoders.orientation import turned
+from clsplat.images.decoders.photo_decoders import (
     DECODED_PHOTO_EXTENSIONS,
     LOSSY_PHOTO_FORMATS,
     PHOTO_HEAD_BYTES,

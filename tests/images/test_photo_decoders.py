@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from clsplat.errors import InputError
-from clsplat.images.decoded_photo import DecodedPhoto
+from clsplat.images.decoders import raw
+from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec
+from clsplat.images.decoders.orientation import turned
+from clsplat.images.decoders.photo_decoders import DECODED_PHOTO_EXTENSIONS, PHOTO_DECODERS, without_converted
+from clsplat.images.decoders.tiff_tags import is_cut_off
 from clsplat.images.exif import exposure_of, lens_of
-from clsplat.images.orientation import turned
-from clsplat.images.photo_decoders import DECODED_PHOTO_EXTENSIONS, PHOTO_DECODERS, without_converted
 from clsplat.images.reading import find_images, image_size, open_image, read_image, stored_range
-from clsplat.images.tiff_tags import is_cut_off
 
 pytestmark = [pytest.mark.needs("pillow_heif"), pytest.mark.needs("rawpy")]
 
@@ -210,6 +211,21 @@ def test_camera_lens_and_exposure(tmp_path: Path) -> None:
     assert exposure_of(tmp_path / "b.heic") is None
 
 
+def test_exif_of_raw_files_that_are_not_plain_tiff(tmp_path: Path) -> None:
+    tiff = exif_bytes(1, 35, 52).removeprefix(b"Exif\0\0")
+    assert tiff.startswith(b"MM\0*")
+    Pillow.fromarray(SMOOTH).save(tmp_path / "a.jpg", exif=exif_bytes(1, 35, 52))
+    jpeg = (tmp_path / "a.jpg").read_bytes()
+    raf = b"FUJIFILMCCD-RAW".ljust(84, b"\0") + struct.pack(">II", 92, len(jpeg)) + jpeg
+    for head in (tiff, b"MMOR" + tiff[4:], raf):
+        (tmp_path / "a.raw").write_bytes(head)
+        spec = photo_spec(1, 1, "RGB", oiio.UINT16, raw._exif(tmp_path / "a.raw"))
+        assert lens_of(spec) == ("Acme", "Cam 1", "", "35.000", "52")
+    for head in (b"", b"\0\0\0\x18ftypcrx ", raf[:88], raf[:84] + b"\xff" * 8):
+        (tmp_path / "a.raw").write_bytes(head)
+        assert not raw._exif(tmp_path / "a.raw")
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.heic", "a.avif", "a.nef", "a.dng", "a.raf"])
 @pytest.mark.parametrize("extension", WRITERS)
 def test_renamed_photographs_are_read_as_what_they_are(tmp_path: Path, extension: str, name: str) -> None:
@@ -285,7 +301,7 @@ def test_without_the_extra_one_line_names_it(tmp_path: Path, monkeypatch: pytest
         write(tmp_path / f"a{extension}")
     for module in ("pillow_heif", "rawpy"):
         monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.setattr("clsplat.images.avif.find_spec", lambda _: None)
+    monkeypatch.setattr("clsplat.images.decoders.avif.find_spec", lambda _: None)
     for extension, kind in (
         (".heic", "a HEIC photograph"),
         (".avif", "an AVIF photograph"),

@@ -81,7 +81,7 @@ def test_copies_are_upright_and_keep_what_pycolmap_reads(tmp_path):
 def test_without_the_extra_photographs_are_left_out_by_name(tmp_path, monkeypatch):
     for name in ("a.heic", "b.heic", "c.dng"):
         (tmp_path / name).write_bytes(b"")
-    monkeypatch.setattr("clsplat.images.photo_decoders.find_spec", lambda _: None)
+    monkeypatch.setattr("clsplat.images.decoders.photo_decoders.find_spec", lambda _: None)
     told = r"no photos found, only 3 such as .*; reading these needs another package: pip install 'clsplat\[photos\]'$"
     refuses(told, sfm_photos.find_photos, tmp_path)
     Pillow.fromarray(GREY).save(tmp_path / "c.jpg")

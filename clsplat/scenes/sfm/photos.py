@@ -21,15 +21,15 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.files.atomic import require_room, room_error, write_error
 from clsplat.files.documents import is_file
 from clsplat.files.names import ON_WINDOWS, native_name
-from clsplat.images.decoded_photo import PHOTOS_EXTRA
-from clsplat.images.exif import lens_of
-from clsplat.images.orientation import turned
-from clsplat.images.photo_decoders import (
+from clsplat.images.decoders.decoded_photo import PHOTOS_EXTRA
+from clsplat.images.decoders.orientation import turned
+from clsplat.images.decoders.photo_decoders import (
     DECODED_PHOTO_EXTENSIONS,
     PHOTO_DECODERS,
     lacks_decoder,
     without_converted,
 )
+from clsplat.images.exif import lens_of
 from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_image, opened
 from clsplat.images.writing import jpeg_room
 from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare

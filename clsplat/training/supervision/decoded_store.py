@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from clsplat.errors import WriteError, reason_of
 from clsplat.files.atomic import TEMPORARY_NAME, atomic_name, is_abandoned, remove
 from clsplat.files.mounts import NetworkRate
-from clsplat.images.photo_decoders import decoder_versions
+from clsplat.images.decoders.photo_decoders import decoder_versions
 from clsplat.version import package_version
 
 FORMAT_VERSION = 1

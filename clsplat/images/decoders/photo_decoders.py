@@ -14,11 +14,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from clsplat.errors import InputError
-from clsplat.images.avif import open_avif_photo
-from clsplat.images.decoded_photo import DecodedPhoto
-from clsplat.images.heif import open_heif_photo
-from clsplat.images.raw import open_raw_photo
-from clsplat.images.tiff_tags import TIFF_BYTE_ORDERS, is_dng
+from clsplat.images.decoders.avif import open_avif_photo
+from clsplat.images.decoders.decoded_photo import DecodedPhoto
+from clsplat.images.decoders.heif import open_heif_photo
+from clsplat.images.decoders.raw import open_raw_photo
+from clsplat.images.decoders.tiff_tags import TIFF_BYTE_ORDERS, is_dng
 
 PHOTO_HEAD_BYTES = 64
 """Number of a file's first bytes from which `decoder_of` recognises a photograph."""

@@ -14,7 +14,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.images.decoded_photo import DecodedPhoto, photo_spec, undecodable, whole_file, without_extra
+from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec, undecodable, whole_file, without_extra
 
 _CHANNELS = {"L": "Y", "LA": "YA", "La": "YA", "RGB": "RGB", "RGBA": "RGBA", "RGBa": "RGBA"}
 """Channels of libheif's modes, which end in the number of bits if that is not 8."""

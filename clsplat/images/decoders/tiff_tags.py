@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 TIFF_BYTE_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
-"""Byte order, as the module struct has it, by the first bytes of a TIFF."""
+"""Byte order, as a character for the module struct, by the first bytes of a TIFF."""
 MAX_TIFF_TAGS, MAX_TIFF_DIRECTORIES, MAX_TIFF_VALUES = 1024, 32, 1 << 16
 """Numbers of a directory's tags, of directories in a file, and of a tag's values beyond which a file is not read on."""
 _TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Raw photographs of cameras (DNG, CR2, CR3, NEF, ARW, RAF, ORF, RW2), developed by rawpy (LibRaw).
 
-The development depends on the file alone: the camera's white balance, the camera's white level, sRGB primaries and the
-sRGB curve, without automatic brightness, as 16 bits. So equal light in two photographs gives equal values, up to the
-camera's exposure.
+The development depends on the file's header alone: the camera's white balance and white level, sRGB primaries and the
+sRGB curve, 16 bits, no automatic brightness. So two photographs with the same exposure and white balance agree in the
+colours of the same surface.
 """
 
 from __future__ import annotations
 
 import io
-import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
 from clsplat.files.names import native_name
-from clsplat.images.decoded_photo import DecodedPhoto, photo_spec, undecodable, without_extra
-from clsplat.images.tiff_tags import TIFF_BYTE_ORDERS, is_cut_off
+from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec, undecodable, without_extra
+from clsplat.images.decoders.tiff_tags import TIFF_BYTE_ORDERS, is_cut_off
 
 SRGB_GAMMA = (2.4, 12.92)
 """Exponent and slope of the sRGB curve, as LibRaw wants them."""
@@ -28,7 +28,7 @@ EXIF_SEARCH_BYTES = 1 << 20
 _ORIENTATION_BY_FLIP = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
 """EXIF orientation by LibRaw's flip."""
 _FUJI_SIGNATURE, _FUJI_JPEG_OFFSET = b"FUJIFILMCCD-RAW", 84
-"""First bytes of RAF, and where RAF has the place of its JPEG, which has the EXIF data."""
+"""First bytes of RAF, and the offset at which RAF gives the offset of its JPEG preview, which has the EXIF data."""
 
 
 def open_raw_photo(path: Path) -> DecodedPhoto:
@@ -50,7 +50,7 @@ def open_raw_photo(path: Path) -> DecodedPhoto:
     width, height = _developed_size(sizes)
     spec = photo_spec(width, height, "RGB", oiio.UINT16, _exif(path))
     spec.attribute("Orientation", _ORIENTATION_BY_FLIP.get(int(sizes.flip), 1))
-    if taken.focal_length > 0:  # of MakerNotes too, in which some cameras write it
+    if taken.focal_length > 0:  # which LibRaw also finds in MakerNotes
         spec.attribute("Exif:FocalLength", float(taken.focal_length))
     for name, text in (("Exif:LensMake", lens.make), ("Exif:LensModel", lens.model)):
         if text and not spec.get_string_attribute(name):
@@ -95,13 +95,15 @@ def _developed(path: Path) -> NDArray[Any]:
             user_sat=_full_exposure(raw),
             user_flip=0,
         )
-    return pixels
+    grey = pixels.ndim == 2 or pixels.shape[2] == 1  # of a camera without colours
+    return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2) if grey else pixels
 
 
 def _full_exposure(raw: Any) -> int | None:
-    """Return the value above black that is white, where LibRaw 0.22 forgets to subtract black; None for its own value.
+    """Return the number of levels from black to white, or None to keep LibRaw's number.
 
-    It does so for DNGs without a colour filter (LinearRaw, as phones write), whose black levels are one per channel.
+    LibRaw 0.22 does not subtract the black level from the white level if a DNG has no colour filter pattern (LinearRaw,
+    which phones write) and a black level for each channel. White would then be up to 5 % too dark.
     """
     import rawpy
 
@@ -112,14 +114,14 @@ def _full_exposure(raw: Any) -> int | None:
 
 
 def _exif(path: Path) -> bytes | None:
-    """Return EXIF data of a raw file as TIFF, None if there is none where the formats have it."""
+    """Return the EXIF data of a raw file, None for formats whose EXIF data is not read (CR3)."""
     with open(path, "rb") as file:
         head = file.read(EXIF_SEARCH_BYTES)
         if head.startswith(_FUJI_SIGNATURE):
             place = head[_FUJI_JPEG_OFFSET : _FUJI_JPEG_OFFSET + 4]
             file.seek(int.from_bytes(place, "big"))
             return _exif_of_jpeg(file.read(EXIF_SEARCH_BYTES))
-    if head[:2] in (b"II", b"MM"):  # TIFF. ORF and RW2 have other numbers in the two bytes that follow
+    if head[:2] in (b"II", b"MM"):  # TIFF; ORF and RW2 differ only in the next two bytes
         return head[:2] + (b"*\0" if head[:2] == b"II" else b"\0*") + head[4:]
     return None
 
@@ -130,6 +132,6 @@ def _exif_of_jpeg(data: bytes) -> bytes | None:
     try:
         with Image.open(io.BytesIO(data)) as picture:
             exif = picture.info.get("exif")
-    except (OSError, ValueError, SyntaxError, struct.error):
+    except Exception:  # noqa: BLE001  # Pillow raises struct's, Python's and its own errors for damaged files
         return None
     return exif if isinstance(exif, bytes) else None

@@ -24,24 +24,24 @@ _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _EXIF_TEXTS = {(0, 0x10F): "Make", (0, 0x110): "Model", (_EXIF_IFD, 0xA433): "Exif:LensMake",
                (_EXIF_IFD, 0xA434): "Exif:LensModel", (_GPS_IFD, 1): "GPS:LatitudeRef",
                (_GPS_IFD, 3): "GPS:LongitudeRef"}  # fmt: skip
-"""OpenImageIO's names of EXIF tags with text, by directory (0: the first) and tag."""
+"""OpenImageIO's names of EXIF tags whose values are texts, by directory (0: the first one) and number of the tag."""
 _EXIF_INTEGERS = {(_EXIF_IFD, 0x8827): "Exif:PhotographicSensitivity",
                   (_EXIF_IFD, 0xA405): "Exif:FocalLengthIn35mmFilm",
                   (_EXIF_IFD, 0xA210): "Exif:FocalPlaneResolutionUnit", (_EXIF_IFD, 0xA002): "Exif:PixelXDimension",
                   (_EXIF_IFD, 0xA003): "Exif:PixelYDimension", (_GPS_IFD, 5): "GPS:AltitudeRef"}  # fmt: skip
-"""The same for whole numbers."""
+"""OpenImageIO's names of EXIF tags whose values are whole numbers, by directory and number."""
 _EXIF_FLOATS = {(_EXIF_IFD, 0x829A): "ExposureTime", (_EXIF_IFD, 0x829D): "FNumber",
                 (_EXIF_IFD, 0x920A): "Exif:FocalLength", (_EXIF_IFD, 0xA20E): "Exif:FocalPlaneXResolution",
                 (_EXIF_IFD, 0xA20F): "Exif:FocalPlaneYResolution", (_GPS_IFD, 6): "GPS:Altitude"}  # fmt: skip
-"""The same for fractions."""
+"""OpenImageIO's names of EXIF tags whose values are fractions, by directory and number."""
 _GPS_ANGLES = {(_GPS_IFD, 2): "GPS:Latitude", (_GPS_IFD, 4): "GPS:Longitude"}
-"""The same for angles in degrees, minutes and seconds."""
+"""OpenImageIO's names of EXIF tags whose values are degrees, minutes and seconds, by directory and number."""
 
 
 class DecodedPhoto:
     """A photograph with the methods of OpenImageIO's input that readers of images call.
 
-    The pixels are decoded when they are read. An error then becomes the text of `geterror`, as for OpenImageIO's input.
+    The pixels are decoded when they are read. `geterror` then gives the error, as for OpenImageIO's input.
     """
 
     def __init__(self, kind: str, spec: Any, decode: Callable[[], tuple[NDArray[Any], float]]) -> None:
@@ -72,9 +72,8 @@ class DecodedPhoto:
             return None
         spec, name = self._spec, str(oiio.TypeDesc(form))
         if pixels.shape != (spec.height, spec.width, spec.nchannels):
-            self._error = (
-                f"has {pixels.shape} pixels, expected {(spec.height, spec.width, spec.nchannels)} as told before"
-            )
+            expected = (spec.height, spec.width, spec.nchannels)
+            self._error = f"decodes to values of shape {pixels.shape}, expected {expected} as in its header"
             return None
         if name == str(pixels.dtype) and highest == np.iinfo(pixels.dtype).max:
             return pixels
@@ -93,7 +92,7 @@ class DecodedPhoto:
 
 
 def photo_spec(width: int, height: int, channels: str, form: Any, exif: bytes | None = None) -> Any:
-    """Return OpenImageIO's specification of an upright photograph with straight alpha.
+    """Return OpenImageIO's specification of a photograph that is upright and has straight alpha.
 
     channels: a letter for each channel, such as "RGBA" or "YA".
     form: OpenImageIO's pixel type.
@@ -137,7 +136,7 @@ def _set_exif(spec: Any, exif: bytes) -> None:
 
 
 def _number(value: Any) -> float | None:
-    """Return an EXIF value as a finite number of at least 0, or the first of several; None if it is none."""
+    """Return an EXIF value, or the first of several, as a float; None if it is not a finite number of at least 0."""
     value = value[0] if isinstance(value, (tuple, bytes)) and len(value) else value
     try:
         number = float(value)

@@ -15,8 +15,8 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.images.decoded_photo import DecodedPhoto, photo_spec, undecodable, whole_file, without_extra
-from clsplat.images.orientation import turned
+from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec, undecodable, whole_file, without_extra
+from clsplat.images.decoders.orientation import turned
 
 _ORIENTATION_TAG = 0x112
 
