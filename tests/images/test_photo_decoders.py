@@ -75,6 +75,7 @@ def dng(path: Path, orientation: int = 1) -> None:
 WRITERS: dict[str, Callable[..., None]] = {".heic": heic, ".avif": avif, ".webp": webp, ".dng": dng}
 
 
+@pytest.mark.brings("phones, cameras", "HEIC, AVIF, raw files, turned by EXIF", "upright pictures, raw ones developed")
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("extension", WRITERS)
 def test_pixels_of_the_png_turned_once(tmp_path: Path, extension: str, orientation: int) -> None:
@@ -176,6 +177,12 @@ def test_raw_with_a_colour_filter(tmp_path: Path) -> None:
     image = read_image(write_dng(tmp_path / "a.dng", values, white=60000))
     assert image.shape == (HEIGHT - 1, WIDTH, 3)
     assert np.abs(image - srgb_of(colour)).max() < 1 / 2048  # as for all three channels: a flat colour stays flat
+
+
+def test_raw_of_a_camera_without_colours(tmp_path: Path) -> None:
+    image = read_image(write_dng(tmp_path / "a.dng", np.full((HEIGHT, WIDTH), 20000), mosaic=False))
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(image - srgb_of(np.array(20000 / 65535))).max() < 1 / 1024  # as for colours
 
 
 def test_raw_without_a_white_balance_is_not_balanced_by_its_picture(tmp_path: Path) -> None:
@@ -313,6 +320,7 @@ def test_without_the_extra_one_line_names_it(tmp_path: Path, monkeypatch: pytest
     assert read_image(tmp_path / "a.webp").shape == (HEIGHT, WIDTH, 3)
 
 
+@pytest.mark.brings("cameras, converters", "IMG.jpg beside IMG.dng or IMG.heic", "IMG.jpg alone")
 def test_photographs_that_are_there_in_another_format_are_left_out(tmp_path: Path) -> None:
     names = ("a.JPG", "A.dng", "b.heic", "b.heic.jpg", "c.heic", "c.heic.png", "d.nef", "e/d.jpg", "f.avif", "f.heic")
     used, converted = without_converted(tmp_path / name for name in names)

@@ -82,7 +82,7 @@ def test_without_the_extra_photographs_are_left_out_by_name(tmp_path, monkeypatc
     for name in ("a.heic", "b.heic", "c.dng"):
         (tmp_path / name).write_bytes(b"")
     monkeypatch.setattr("clsplat.images.decoders.photo_decoders.find_spec", lambda _: None)
-    told = r"no photos found, only 3 such as .*; reading these needs another package: pip install 'clsplat\[photos\]'$"
+    told = r"has only 3 photo\(s\) such as a\.heic, and reading them needs another package: pip install .*\[photos\]'$"
     refuses(told, sfm_photos.find_photos, tmp_path)
     Pillow.fromarray(GREY).save(tmp_path / "c.jpg")
     photos, left_out = sfm_photos.find_photos(tmp_path)

@@ -78,10 +78,12 @@ def write_dng(
     black: int = 0,
     white: int = 65535,
     focal: tuple[int, int] | None = None,
+    mosaic: bool = True,
 ) -> Path:
     """Write an uncompressed DNG of a camera whose channels are linear sRGB.
 
     values: the sensor's integers: (H, W, 3), or (H, W) in the pattern red, green / green, blue.
+    mosaic: False for a camera without colours, with values (H, W).
     neutral: the camera's values of a white surface, as a fraction of the largest.
     black, white: the sensor's values of no light and of full exposure.
     focal: EXIF's focal length, and its 35 mm equivalent, in whole millimetres.
@@ -94,7 +96,7 @@ def write_dng(
         257: _longs(height),
         258: _shorts(*[16] * planes),
         259: _shorts(1),
-        262: _shorts(34892 if planes == 3 else 32803),
+        262: _shorts(32803 if planes == 1 and mosaic else 34892),
         271: _text("Acme"),
         272: _text("Cam 1"),
         274: _shorts(orientation),
@@ -111,7 +113,7 @@ def write_dng(
         50728: _fractions(5, neutral),
         50778: _shorts(21),
     }
-    if planes == 1:
+    if planes == 1 and mosaic:
         tags |= {33421: _shorts(2, 2), 33422: _bytes(0, 1, 1, 2), 50710: _bytes(0, 1, 2), 50711: _shorts(1)}
     exif: Tags = {}
     if focal:

@@ -98,9 +98,9 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
                 others.append(here / name)
     if not photos:
         kinds = " ".join(sorted(known))
-        needs = f"reading these needs another package: {PHOTOS_EXTRA}"
         if lacking:
-            raise InputError(f"{folder}: no photos found, only {len(lacking)} such as {lacking[0].name}; {needs}")
+            found = f"{len(lacking)} photo(s) such as {min(lacking).name}"
+            raise InputError(f"{folder}: has only {found}, and reading them needs another package: {PHOTOS_EXTRA}")
         unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
         unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
         raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
