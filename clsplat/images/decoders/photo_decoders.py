@@ -105,8 +105,8 @@ def wrong_contents(path: Path, head: bytes) -> InputError | None:
 def without_converted(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
     """Return the pictures to use, and the photographs of PHOTO_DECODERS that are there in another format too.
 
-    IMG_1.dng and IMG_1.heic are left out if IMG_1.jpg or IMG_1.heic.jpg is in their folder: cameras write a JPEG beside
-    a raw file, and HEIC is converted for other programs. IMG_1.heic.png may be a mask, by COLMAP's rule for names.
+    IMG_1.dng and IMG_1.heic are left out if IMG_1.jpg or IMG_1.heic.jpg is in their folder. Cameras write a JPEG beside
+    a raw file, and users convert HEIC for other programs. IMG_1.heic.png may be a mask, by COLMAP's rule for names.
     """
     pictures = list(paths)
     stems = set()

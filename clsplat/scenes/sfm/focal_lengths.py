@@ -10,10 +10,10 @@ from typing import Any
 from clsplat.errors import examples
 
 MAX_FOCAL_DIFFERENCE = 0.1
-"""Largest difference between the focal length found and that of EXIF, as a fraction of the latter, that is not told.
+"""Largest difference between the focal length found and EXIF's, as a fraction of EXIF's, without a warning.
 
-EXIF's 35 mm equivalent is a whole number, which is 4 % for a wide lens of 13 mm, and focusing changes a lens by a few
-per cent.
+Smaller differences are usual: EXIF rounds the 35 mm equivalent to whole millimetres, which is up to 4 % of 13 mm, and
+focusing changes a focal length by a few per cent.
 """
 
 
@@ -49,7 +49,7 @@ def compared(model: Any, given: dict[int, float]) -> list[dict[str, Any]]:
 
 
 def told(cameras: Sequence[dict[str, Any]]) -> str:
-    """Return a text that names the cameras whose focal lengths differ by more than MAX_FOCAL_DIFFERENCE; "" for none.
+    """Return a warning about the cameras whose focal lengths differ by more than MAX_FOCAL_DIFFERENCE; "" for none.
 
     cameras: focal lengths from `compared`.
     """
