@@ -22,7 +22,8 @@ class SfmVerb(Verb):
     """Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder with the photos, searched with its sub-folders. HEIC, AVIF and raw files need the extra photos."""
+    """Folder with the photos, searched with its sub-folders. HEIC, AVIF and raw files need pip install
+    'clsplat[photos]'."""
     output: Output
     """Folder for the scene."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"

@@ -141,6 +141,17 @@ def test_alpha_is_straight(tmp_path: Path, extension: str) -> None:
         assert decibels(image[:, 1:], expected[:, 1:]) > 48  # as without alpha
 
 
+def test_premultiplied_heic_becomes_straight(tmp_path: Path) -> None:
+    import pillow_heif
+
+    straight = np.array([200, 100, 40, 102], np.uint8)
+    premultiplied = np.tile(np.array([80, 40, 16, 102], np.uint8), (64, 64, 1))
+    file = pillow_heif.HeifFile()
+    file.add_frombytes("RGBa", (64, 64), premultiplied.tobytes())
+    file.save(tmp_path / "a.heic", quality=-1, chroma=444, matrix_coefficients=0)
+    np.testing.assert_allclose(255 * read_image(tmp_path / "a.heic"), np.tile(straight, (64, 64, 1)), atol=1e-3)
+
+
 def test_grey_heic(tmp_path: Path) -> None:
     import pillow_heif
 
