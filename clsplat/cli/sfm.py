@@ -22,7 +22,8 @@ class SfmVerb(Verb):
     """Turn photos and videos into a scene: COLMAP's cameras and points, and the undistorted images."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS|VIDEO")]
-    """Folder with photos, videos or both, searched with its sub-folders; or a video. Each video is a camera."""
+    """Folder with photos, videos or both, searched with its sub-folders; or a video. Each video is a camera. HEIC, AVIF
+    and raw files need pip install 'clsplat[photos]'."""
     output: Output
     """Folder for the scene. The frames of videos are written to a folder beside it, NAME_frames."""
     frames: OptionalInt = None

@@ -26,6 +26,7 @@ from clsplat.process import apart
 from clsplat.progress import CountedFraction, Progress, no_progress
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.sfm import copies as sfm_copies
+from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
@@ -123,10 +124,10 @@ def reconstruct(
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
-    Warns of copies, and of photographs that get no pose, have an unreadable format, or lost their alpha. Raises
-    InputError for a folder without photographs, a photograph that does not decode, and an existing output that must not
-    be replaced. Also raises InputError if the cameras cannot be recovered. Raises ClsplatError if pycolmap fails. After
-    KeyboardInterrupt no files remain.
+    Warns of copies, of photographs that get no pose, have an unreadable format, or lost their alpha, and of focal
+    lengths that differ from EXIF's. Raises InputError for a folder without photographs, a photograph that does not
+    decode, and an existing output that must not be replaced. Also raises InputError if the cameras cannot be recovered.
+    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain.
     """
     report = progress or no_progress
     settings.check()
@@ -158,6 +159,8 @@ def reconstruct(
             raise InputError(_no_model(images, len(photos), answer["failure"]))
         _write_record(work / "result", fingerprint, photos, answer["result"])
         _warn_of_losses(images, photos, answer["result"]["registered"], work / "result" / "images", masks)
+        if told := focal_lengths.told(answer["result"].get("focal_lengths", ())):
+            warn(f"{images}: {told}")
         move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -206,7 +209,7 @@ def _staged_photos(
 def _staged_masks(
     photos: list[sfm_photos.Photo], mask_files: dict[str, Path], masks: MaskUse | None, work: Path
 ) -> list[str]:
-    """Write the masks of the photographs under `work`. Returns the names of the photographs with a mask.
+    """Write the masks of the photographs under `work`. Returns the names in the scene of the photographs with a mask.
 
     mask_files: paths of the mask files, by photograph. A photograph's alpha may be a mask too.
     """
@@ -216,10 +219,10 @@ def _staged_masks(
     for photo in photos:
         cut = photo.transparent and masks.alpha != "blend"
         if cut or photo.name in mask_files:
-            mask_file, target = mask_files.get(photo.name), work / "masks" / f"{photo.name}.png"
-            inner = work / "photos" / photo.name if cut else None
+            mask_file, target = mask_files.get(photo.name), work / "masks" / f"{photo.scene_name}.png"
+            inner = work / "photos" / photo.scene_name if cut else None
             stage_mask(mask_file, target, (photo.width, photo.height), invert=masks.invert, photo=inner)
-            masked.append(photo.name)
+            masked.append(photo.scene_name)
     return masked
 
 
@@ -256,7 +259,7 @@ def sfm_task(
 
 def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo], result: dict[str, Any]) -> None:
     """Write sfm.json, the record of a reconstruction, into the folder of the result."""
-    missing = sorted({photo.name for photo in photos} - set(result["registered"]))
+    missing = sorted({photo.scene_name for photo in photos} - set(result["registered"]))
     record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
     record["files"] = _sizes(folder)
     (folder / SFM_RECORD_FILE).write_bytes((json.dumps(record, indent=2) + "\n").encode())
@@ -271,7 +274,7 @@ def _warn_of_losses(
     result: folder of the undistorted photographs.
     masks: use of masks and alpha. If alpha was used as a mask, its loss does not matter.
     """
-    if missing := sorted({photo.name for photo in photos} - set(registered)):
+    if missing := sorted({photo.scene_name for photo in photos} - set(registered)):
         warn(f"{images}: no camera pose was found for {_listed(missing)}, which will not be used")
     lost = _without_their_alpha(photos, registered, result)
     if lost and (masks is None or masks.alpha == "blend"):
@@ -314,7 +317,7 @@ def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], 
 
     pycolmap keeps alpha only if the lens model has no distortion, because it then copies the file.
     """
-    transparent = {photo.name for photo in photos if photo.transparent}
+    transparent = {photo.scene_name for photo in photos if photo.transparent}
     return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
 
 

@@ -25,6 +25,8 @@ from typing import Any, TextIO
 
 import pycolmap
 
+from clsplat.scenes.sfm import focal_lengths
+
 MAX_SINGLE_THREAD_PHOTOS = 80
 """Number of photographs up to which matching and mapping run on one thread each, so that their results are
 reproducible.
@@ -70,6 +72,7 @@ class Worker:
         pycolmap.set_random_seed(self.task["seed"])
         self.extract()
         renumber_by_name(self.database)
+        given = focal_lengths.from_exif(self.database)
         self.match()
         models = self.map(relaxed=False)
         if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
@@ -88,6 +91,7 @@ class Worker:
                 "points": model.num_points3D(),
                 "mean_reprojection_error": model.compute_mean_reprojection_error(),
                 "pycolmap": pycolmap.__version__,
+                "focal_lengths": focal_lengths.compared(model, given),
             }
         )
 
