@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat sfm`: structure from motion, which makes a COLMAP scene from a folder of photos."""
+"""`clsplat sfm`: structure from motion, which makes a COLMAP scene from photos and videos."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ from clsplat.progress import StageProgress
 
 @dataclass(frozen=True)
 class SfmVerb(Verb):
-    """Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images."""
+    """Turn photos and videos into a scene: COLMAP's cameras and points, and the undistorted images."""
 
-    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder with the photos, searched with its sub-folders."""
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS|VIDEO")]
+    """Folder with photos, videos or both, searched with its sub-folders; or a video. Each video is a camera."""
     output: Output
-    """Folder for the scene."""
+    """Folder for the scene. The frames of videos are written to a folder beside it, NAME_frames."""
+    frames: OptionalInt = None
+    """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: by
+    length and motion, at most 300."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match every pair of photos, or only neighbours in name order (for video). auto: every pair up to 100 photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
@@ -48,9 +51,11 @@ class SfmVerb(Verb):
 
 
 def run(verb: SfmVerb, services: Services) -> int:
-    """Run structure from motion on the folder of photos, and write the scene."""
-    if not verb.photos.is_dir():
-        raise InputError(f"{verb.photos}: no such folder, expected one with photos")
+    """Run structure from motion on the photos and videos, and write the scene."""
+    if verb.frames is not None and verb.frames < 1:
+        raise InputError(f"--frames {verb.frames}: expected at least 1")
+    if not verb.photos.exists():
+        raise InputError(f"{verb.photos}: no such folder or video, expected one with photos")
     if verb.threads is not None and verb.threads < 1:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
     if verb.invert_masks and not verb.masks:
@@ -68,6 +73,7 @@ def run(verb: SfmVerb, services: Services) -> int:
         threads=verb.threads,
         overwrite=verb.overwrite,
         masks=masks,
+        frames=verb.frames,
         progress=StageProgress(),
     )
     if verb.json:

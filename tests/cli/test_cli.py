@@ -143,7 +143,7 @@ def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
-    options = {"threads": None, "overwrite": False, "masks": None}
+    options = {"threads": None, "overwrite": False, "masks": None, "frames": None}
     assert calls == [(folder, SfmSettings("sequential", "auto"), options)]
     assert "none: no such folder" in rejected(capsys, ["sfm", tmp_path / "none", "-o", tmp_path / "out"])
 

@@ -61,6 +61,7 @@ NEEDS = {
     "av": of_extra("av", "PyAV", "video"),
     "chromium": Need("Chromium", "apt-get install chromium, or set CLSPLAT_CHROMIUM", lambda: bool(chromium_path())),
     "distributed": of_extra("distributed", "distributed", "farm"),
+    "ffmpeg": Need("FFmpeg", "apt-get install ffmpeg", lambda: shutil.which("ffmpeg") is not None),
     "gsplat": Need("gsplat", "pip install --no-deps gsplat==1.5.3", lambda: find_spec("gsplat") is not None),
     "hatchling": of_extra("hatchling", "hatchling", "test"),
     "importlinter": of_extra("importlinter", "import-linter", "dev"),

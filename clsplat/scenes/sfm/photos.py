@@ -54,21 +54,23 @@ class Photo:
     thumb: Thumb | None = None
 
 
-def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
+def find_photos(
+    folder: Path, excluded: Collection[Path] = (), *, needed: bool = True
+) -> tuple[list[Path], dict[str, list[Path]]]:
     """Return the photographs below a folder, sorted by name, and the files that are left out, keyed by the reason.
 
-    Hidden files and folders are skipped, as is `excluded` (the output, if it is inside). Raises InputError for a folder
-    that does not exist, cannot be read, or has no photographs.
+    Hidden files and folders are skipped, as are the folders `excluded` (outputs, if they are inside). Raises InputError
+    for a folder that does not exist or cannot be read, and for one without photographs if they are `needed`.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a folder with photos")
-    skip = excluded.resolve() if excluded is not None else None
+    skip = {path.resolve() for path in excluded}
     photos: list[Path] = []
     others: list[Path] = []
     broken: list[Path] = []
     for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
         here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != skip]
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
         for name in files:
             extension = Path(name).suffix.lower()
             if name.startswith("."):
@@ -81,7 +83,7 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
                 photos.append(here / name)
             elif extension in UNREADABLE_PHOTO_EXTENSIONS:
                 others.append(here / name)
-    if not photos:
+    if not photos and needed:
         kinds = " ".join(sorted(SFM_PHOTO_EXTENSIONS))
         unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
         unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""

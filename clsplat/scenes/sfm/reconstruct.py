@@ -27,6 +27,7 @@ from clsplat.progress import CountedFraction, Progress, no_progress
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -101,9 +102,13 @@ def reconstruct(
     threads: int | None = None,
     overwrite: bool = False,
     masks: MaskUse | None = None,
+    frames: int | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
+
+    images: a folder with photographs, videos or both; or a video. Frames of videos are written to a folder beside the
+        output (`video_frames.frames_folder`), and used like photographs.
 
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
     folder is created when all files are complete. An existing result for the same photographs and settings is reused.
@@ -112,6 +117,7 @@ def reconstruct(
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
+    frames: number of frames of each video; None for a number by its length and motion.
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
@@ -123,15 +129,16 @@ def reconstruct(
     """
     report = progress or no_progress
     settings.check()
-    paths, left_out = sfm_photos.find_photos(images, excluded=output)
+    videos = frames_of_videos(images, output, frames, report, overwrite=overwrite)
+    paths, left_out = videos.photos_beside(images, output)
     copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
     paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
     shapes = _masks(images, paths, masks)
-    fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, shapes)}")
+    fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, shapes)}{videos.fingerprint}")
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
         return output
-    _require_enough(images, len(paths))
+    _require_enough(images, len(paths) + len(videos.paths))
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
         warn(f"{images}: {_listed(names)} left out: {why}")
@@ -141,9 +148,9 @@ def reconstruct(
     # Work in the output's parent folder, so that the last step is a rename within one file system.
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
-        photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
+        photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
         masked = _staged_masks(photos, shapes, masks, work)
-        answer = _run_worker(sfm_task(settings, photos, masked, work, workers), work, report)
+        answer = _run_worker(sfm_task(settings, photos, masked, videos.sequences, work, workers), work, report)
         if "failure" in answer:
             raise InputError(_no_model(images, len(photos), answer["failure"]))
         _write_record(work / "result", fingerprint, photos, answer["result"])
@@ -166,9 +173,15 @@ def _described(masks: MaskUse | None, shapes: dict[str, Path]) -> str:
 
 
 def _staged_photos(
-    images: Path, paths: list[Path], copies: dict[str, sfm_copies.Copy], target: Path, report: Progress, threads: int
+    images: Path,
+    paths: list[Path],
+    copies: dict[str, sfm_copies.Copy],
+    videos: VideoFrames,
+    target: Path,
+    report: Progress,
+    threads: int,
 ) -> list[sfm_photos.Photo]:
-    """Put the photographs under `target`. Returns the photographs that are not copies, and warns of copies.
+    """Put the photographs and the videos' frames under `target`. Returns them without copies, and warns of copies.
 
     copies: copies that were found before the photographs were decoded, by name.
     Raises InputError if too few photographs remain.
@@ -182,6 +195,7 @@ def _staged_photos(
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
         again = f"{count} and left out ({sfm_copies.listed(copies)}); to use the copies instead, give only their folder"
         warn(f"{images}: {again}")
+    photos += videos.staged(target, lambda fraction: report("reading frames", fraction), threads)
     _require_enough(images, len(photos))
     return photos
 
@@ -207,11 +221,18 @@ def _staged_masks(
 
 
 def sfm_task(
-    settings: SfmSettings, photos: list[sfm_photos.Photo], masked: list[str], work: Path, threads: int
+    settings: SfmSettings,
+    photos: list[sfm_photos.Photo],
+    masked: list[str],
+    sequences: list[list[str]],
+    work: Path,
+    threads: int,
 ) -> dict[str, Any]:
     """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON.
 
-    masked: names of the photographs with a mask. work: folder for the photographs, masks and intermediate files.
+    masked: names of the photographs with a mask.
+    sequences: names of each video's frames, in display order.
+    work: folder for the photographs, masks and intermediate files.
     """
     many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
     return {
@@ -219,6 +240,7 @@ def sfm_task(
         "photos": str(work / "photos"),
         "work": str(work),
         "groups": sfm_photos.camera_groups(photos, settings.shared_camera),
+        "sequences": sequences,
         "sequential": settings.matching == "sequential" or (settings.matching == "auto" and many),
         "camera_model": settings.camera_model,
         "max_image_size": settings.max_image_size,
