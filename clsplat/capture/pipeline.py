@@ -15,6 +15,7 @@ from pathlib import Path
 from clsplat.capture.folder import CaptureFolder
 from clsplat.capture.pictures import ModelPictures
 from clsplat.capture.progress import CaptureProgress
+from clsplat.capture.sources import PhotographSource
 from clsplat.capture.training import evaluation_of, train_scene
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
@@ -28,7 +29,6 @@ from clsplat.report.page import write_report
 from clsplat.runs.run import Run
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.photo_files import find_images
 from clsplat.scenes.sfm.reconstruct import DEFAULT_SFM_SETTINGS, SFM_RECORD_FILE, SfmSettings, reconstruct
 
 ASSUMED_PHOTOGRAPHS = 100
@@ -42,8 +42,8 @@ SECONDS_PER_PICTURE = 0.15
 SECONDS_PER_REPORT = 5.0
 """Expected seconds to write a report."""
 
-TakePhotographs = Callable[[Progress], Path]
-"""Function of the first stage. It makes the photographs, or finds them, and returns their folder."""
+TakePhotographs = Callable[[Progress], PhotographSource]
+"""Function of the first stage, which makes or finds the photographs."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,21 @@ def make_capture(folder: CaptureFolder, take: TakePhotographs, plan: CapturePlan
             folder.begin("frames", plan.source)
             photographs = take(progress)
         with progress.stage("cameras"):
-            progress.expect("cameras", len(find_images(photographs)) * SFM_SECONDS_PER_PHOTOGRAPH)
+            progress.expect("cameras", photographs.count * SFM_SECONDS_PER_PHOTOGRAPH)
             folder.begin("cameras", plan.source)
-            reconstruct(photographs, folder.scene, plan.sfm, progress=progress)
+            reconstruct(
+                photographs.path,
+                folder.scene,
+                plan.sfm,
+                frames=photographs.frames,
+                frames_to=photographs.frames_to,
+                progress=progress,
+            )
         with progress.stage("training"):
             run = _trained(folder, plan, device, progress)
         _show(folder, run, plan, device, progress)
     result = evaluation_of(run)
-    print(_closing(folder, photographs, run, result, time.monotonic() - start), file=sys.stderr)
+    print(_closing(folder, photographs.path, run, result, time.monotonic() - start), file=sys.stderr)
     return result
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, Suppress, arg
 
-from clsplat.cli.options import DeviceChoice, Flag, Output, Verb
+from clsplat.cli.options import DeviceChoice, Flag, OptionalInt, Output, Verb
 from clsplat.cli.session import Services
 from clsplat.config.cli_defaults import CAPTURE_ITERATIONS
 from clsplat.config.training import TrainConfig
@@ -20,16 +20,18 @@ from clsplat.config.training import TrainConfig
 
 @dataclass(frozen=True)
 class CaptureVerb(Verb):
-    """Turn photographs into a trained model, with its report, thumbnail and turntable.
+    """Turn photos or videos into a trained model, with its report, thumbnail and turntable.
 
     The stages are those of clsplat sfm, train --auto, report, thumbnail and render. After Ctrl-C the same command goes
     on in the stage that was under way.
     """
 
     input: Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT")]
-    """A folder with photographs, searched with its sub-folders."""
+    """A folder with photos, videos or both, searched with its sub-folders; or one or several videos."""
     output: Output
-    """Folder for the results: scene/, run/, turntable/, report.html, thumbnail.png and capture.json."""
+    """Folder for the results: frames/ of videos, scene/, run/, turntable/, report.html, thumbnail.png, capture.json."""
+    frames: OptionalInt = None
+    """Number of frames to take from each video, as with clsplat sfm --frames. If not given: by length and motion."""
     iterations: int = CAPTURE_ITERATIONS
     """Training steps. If not given, they also follow what the photographs ask for, as with clsplat train --auto."""
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
@@ -49,6 +51,8 @@ class CaptureVerb(Verb):
     def again(self) -> str:
         """The command that goes on after an interruption."""
         words = ["clsplat", "capture", *map(str, self.input), "-o", str(self.output)]
+        if self.frames is not None:
+            words += ["--frames", str(self.frames)]
         if "iterations" in self.given:
             words += ["--iterations", str(self.iterations)]
         if self.device.selector is not None:
@@ -64,6 +68,7 @@ def run(verb: CaptureVerb, services: Services) -> int:
         verb.output,
         iterations=verb.iterations,
         again=verb.again,
+        frames=verb.frames,
         given=verb.given & {"iterations"},
         device=verb.device.selector,
         overwrite=verb.overwrite,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from clsplat.capture.folder import CaptureFolder
 from clsplat.capture.pipeline import CapturePlan, make_capture
+from clsplat.capture.sources import PhotographSource
 from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
 from clsplat.demo.ray_caster import write_photos
@@ -59,8 +60,8 @@ def claim(folder: CaptureFolder, iterations: int) -> None:
     folder.claim(asked, "demo", overwrite="demo" in earlier and earlier != asked)
 
 
-def make_photos(photos: Path, progress: Progress = no_progress) -> Path:
-    """Create the demo's photographs in the folder `photos` unless they are complete. Returns the folder.
+def make_photos(photos: Path, progress: Progress = no_progress) -> PhotographSource:
+    """Create the demo's photographs in the folder `photos` unless they are complete, and return them.
 
     Raises InputError if the folder holds other files.
     """
@@ -70,4 +71,4 @@ def make_photos(photos: Path, progress: Progress = no_progress) -> Path:
         raise InputError(f"{photos}: holds files that the demo did not create, expected a new folder")
     if existing != expected:
         write_photos(photos, count=DEMO_PHOTO_COUNT, progress=progress)
-    return photos
+    return PhotographSource(photos, DEMO_PHOTO_COUNT)

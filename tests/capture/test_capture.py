@@ -42,7 +42,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def known_cameras(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace structure from motion, and make the turntable short."""
 
-    def reconstruct(photographs: Path, output: Path, settings: object, *, progress: Callable[..., None]) -> Path:
+    def reconstruct(
+        photographs: Path, output: Path, settings: object, *, progress: Callable[..., None], **_: object
+    ) -> Path:
         progress("finding features", 0.5)
         if not output.exists():
             shutil.copytree(scene, output)
@@ -218,11 +220,15 @@ def test_wrong_input_is_refused_before_anything_is_written(photographs: Path, tm
     out = tmp_path / "shot"
     note = tmp_path / "note.txt"
     note.write_text("text")
+    video = tmp_path / "a.mp4"
+    video.write_bytes(b"")
     for inputs, text in (
         ([], "INPUT is missing"),
         ([tmp_path / "nowhere"], f"{tmp_path / 'nowhere'}: no such file or folder"),
-        ([note], f"{note}: is a file, expected a folder of photographs"),
-        ([photographs, photographs.parent], "is a second input"),
+        ([note], f"{note}: is a file, expected a folder of photographs or a video (.mp4 "),
+        ([photographs, photographs.parent], f"{photographs}: is a folder among 2 inputs, expected a single folder, or"),
+        ([video, video], f"{video}: an input is given twice"),
+        ([photographs, "--frames", 0], "--frames 0: expected at least 1"),
         ([tmp_path], f"{out}: is inside the input {tmp_path}"),
     ):
         assert text in rejected(capsys, ["capture", *inputs, "-o", out])
