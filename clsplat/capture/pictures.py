@@ -63,7 +63,7 @@ class ModelPictures:
                 write_image(file, self._drawn(camera))
             progress("rendering the turntable", (index + 1) / len(files))
         if video is not None:
-            progress("encoding the turntable's video")
+            progress("encoding the turntable's video", None)
             with video_writer(video) as writer:
                 for file in files:  # from the files, so that the video has the same bytes after an interruption
                     writer.add(frame_planes(read_image(file)))

@@ -144,7 +144,7 @@ def _write_report(folder: CaptureFolder, run: Run, progress: Progress) -> None:
     if folder.report.is_file():
         progress("using the report written before", 1.0)
         return
-    progress("writing the report")
+    progress("writing the report", None)
     if not (run.path / REPORT_FILE_NAME).is_file():
         write_report(run)
     atomic_write(folder.report, (run.path / REPORT_FILE_NAME).read_bytes())

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from clsplat.capture.folder import CaptureFolder
 from clsplat.errors import InputError
+from clsplat.images.reading import find_images
 from clsplat.progress import Progress
-from clsplat.scenes.photo_files import find_images
 from clsplat.scenes.sfm.video_frames import frames_of_videos
 from clsplat.scenes.video.frames import take_frames
 from clsplat.scenes.video.reading import VIDEO_INPUT_SUFFIXES, is_video_name
