@@ -42,7 +42,7 @@ class Choice:
     """The chosen frames of a video. F: frames of the video, N: chosen frames, fewer than stretches if some are alike.
 
     frames: (N,), indices of the chosen frames in display order.
-    stretches: (F,), number of the stretch of each frame.
+    stretches: (F,), number of the stretch of each frame, -1 for fast frames.
     fast: (F,), True for frames during which the camera is too fast.
     blurred: (F,), True for frames that are blurred against their neighbours.
     travelled: motion of the usable frames in longer sides.
@@ -63,18 +63,22 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
     """Choose frames of a video. count: number of frames; None for a number by length and motion.
 
     The camera's way is divided into `count` stretches of equal motion, so that a camera that stands still gives one
-    frame. The sharpest frame of each stretch is chosen. It is looked for in the stretch's middle half, if one there is
-    sharper than the stretch's median. Fast, blurred and damaged frames are left out, and of two alike frames in a row
-    the less sharp one.
+    frame. If there are no more usable frames than `count`, each is a stretch. The sharpest frame of each stretch is
+    chosen. It is looked for in the stretch's middle half, if one there is sharper than the stretch's median. Fast,
+    blurred and damaged frames are left out, and of two alike frames in a row the less sharp one.
     """
     fast, blurred = fast_frames(measured), blurred_frames(measured)
     way = travelled(measured, fast)
     total = float(way[-1])
     wanted = count if count is not None else default_count(total, measured.seconds[-1], len(measured))
-    stretches = np.minimum((way / max(total, 1e-9) * wanted).astype(np.int64), wanted - 1)
     usable = measured.whole & ~fast & ~blurred
+    if wanted >= usable.sum():
+        stretches = np.arange(len(measured))
+    else:
+        stretches = np.minimum((way / max(total, 1e-9) * wanted).astype(np.int64), wanted - 1)
+    stretches[fast] = -1
     chosen = []
-    for number in np.unique(stretches):
+    for number in np.unique(stretches[~fast]):
         inside = np.flatnonzero(stretches == number)
         if (best := _sharpest(measured.sharpness, way, inside, usable)) is not None:
             chosen.append(best)
@@ -148,7 +152,8 @@ def _sharpest(sharpness: Float64, way: Float64, inside: NDArray[np.int64], usabl
     if not len(middle):
         return best
     central = int(middle[sharpness[middle].argmax()])
-    return central if sharpness[central] > np.median(sharpness[inside]) else best
+    good = sharpness[central] > np.median(sharpness[inside]) or sharpness[central] == sharpness[best]
+    return central if good else best
 
 
 def unlike(chosen: list[int], measured: Measurements) -> list[int]:
