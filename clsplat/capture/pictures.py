@@ -20,7 +20,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.shots.generated import turntable
 
-THUMBNAIL_SIDE_PX = 512
+CAPTURE_THUMBNAIL_SIDE_PX = 512
 """Width and height of a capture's thumbnail in pixels."""
 TURNTABLE_VIDEO_FILE = "turntable.mp4"
 """Video of the turntable, in the folder of its frames."""
@@ -45,7 +45,7 @@ class ModelPictures:
 
     def write_thumbnail(self, path: Path) -> None:
         """Write the first picture of the turntable as a small square PNG."""
-        write_image(path, self._drawn(self.path[0].reshaped(THUMBNAIL_SIDE_PX, THUMBNAIL_SIDE_PX)))
+        write_image(path, self._drawn(self.path[0].reshaped(CAPTURE_THUMBNAIL_SIDE_PX, CAPTURE_THUMBNAIL_SIDE_PX)))
 
     def write_turntable(self, folder: Path, progress: Progress = no_progress) -> Path | None:
         """Write the turntable's frames and, if PyAV is installed, its video. Returns the video's path, or None.

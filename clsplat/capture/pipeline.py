@@ -35,7 +35,7 @@ ASSUMED_PHOTOGRAPHS = 100
 """Number of photographs for the remaining time as long as the number is not known."""
 SFM_SECONDS_PER_PHOTOGRAPH = 0.7
 """Expected seconds of structure from motion per photograph, on two cores."""
-CPU_SECONDS_PER_STEP, GPU_SECONDS_PER_STEP = 0.06, 0.005
+CPU_SECONDS_PER_STEP, GPU_SECONDS_PER_STEP = 0.05, 0.005
 """Expected seconds of a training step before the first steps are measured: on two cores, and on a GPU."""
 SECONDS_PER_PICTURE = 0.15
 """Expected seconds to render and write a frame of a turntable, on two cores."""

@@ -7,14 +7,18 @@ Structure from motion is replaced by a scene with known cameras, except in slow 
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from calls import Capture, error_line, printed, raising, rejected
+from scipy import ndimage
 from tiny import write_scene
+from walk_videos import write_walk
 
 from clsplat.capture import pipeline, run
 from clsplat.capture.progress import CaptureProgress
@@ -214,6 +218,26 @@ def test_an_error_names_the_stage(
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith(f"clsplat: error: stage {stage}: ")
     printed(capsys, words(photographs, tmp_path / "shot"))
+
+
+@pytest.mark.needs("av")
+def test_a_video_and_the_command_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    """Its frames are taken once. Another video, or another number of frames, is another call."""
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).uniform(0, 1, (48, 130, 3)), (1.5, 1.5, 0))
+    picture = (noise - noise.min()) / (noise.max() - noise.min())
+    video = write_walk(tmp_path / "my walk.mp4", [picture[:, 3 * index : 3 * index + 64] for index in range(20)])
+    folder = tmp_path / "shot"
+    call = words(video, folder, "--frames", 4)
+    with monkeypatch.context() as patch:
+        interrupt("training", 1, patch)
+        assert main(call) == 130
+    again = f"clsplat capture '{video}' -o {folder} --frames 4 --iterations {STEPS}"
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"go on with: {again}")
+    assert len(list(folder.glob("frames/my walk.mp4/*.jpg"))) == 4
+    told = printed(capsys, shlex.split(again)[1:]).err
+    assert "1/6 frames: using the frames taken before 100 %" in told
+    assert "frames 4, not with frames 5; choose" in rejected(capsys, words(video, folder, "--frames", 5))
+    assert "frames 4, not with no frames; choose" in rejected(capsys, words(video, folder))
 
 
 def test_wrong_input_is_refused_before_anything_is_written(photographs: Path, tmp_path: Path, capsys: Capture) -> None:
