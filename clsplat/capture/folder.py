@@ -52,14 +52,14 @@ class CaptureFolder:
         return dict(self._read()["asked"]) if is_file(self.record_path) else {}
 
     def claim(self, asked: Mapping[str, Any], verb: str, *, overwrite: bool = False) -> None:
-        """Record a call of the verb `verb` in capture.json, if the folder is new or was made by the same call.
+        """Record a call of the verb `verb` in capture.json, if the folder has no results or was made by the same call.
 
         asked: input and settings of the call, as values for JSON.
         overwrite: accept a folder that another call has made. If the call is the same, all results are made again.
         Raises InputError for a folder of another call, and for results that are not recorded in capture.json.
         """
-        if not is_file(self.record_path):
-            found = [path.name for path in self.results.values() if path.exists() or path.is_symlink()]
+        found = [path.name for path in self.results.values() if path.exists() or path.is_symlink()]
+        if not is_file(self.record_path) or not found:
             if found:
                 raise InputError(
                     f"{self.path}: holds {examples(found, len(found))}, which the {verb} did not create but would "

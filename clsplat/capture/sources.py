@@ -75,8 +75,9 @@ def photographs_of(
     length and motion. Raises InputError like `take_frames`.
     """
     if not sources[0].is_dir():
-        root = Path(os.path.commonpath([path.resolve().parent for path in sources]))
-        videos = [path.resolve() for path in sources]
+        # names of several videos begin at the folder that they share
+        root = Path(os.path.commonpath([path.absolute().parent for path in sources])) if len(sources) > 1 else None
+        videos = [path.absolute() for path in sources] if root else sources
         taken = take_frames(videos, folder.frames, root=root, count=frames, progress=progress)
         return PhotographSource(folder.frames, len(taken.names))
     (source,) = sources

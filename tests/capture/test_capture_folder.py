@@ -110,8 +110,15 @@ def test_files_of_others_in_a_run_stay(folder: CaptureFolder) -> None:
     assert {name for name in files_of(folder) if name.startswith("run/")} == {"run/notes.txt"}
 
 
+def test_a_call_without_results_can_be_mended(folder: CaptureFolder) -> None:
+    folder.begin("frames", "a")
+    folder.claim({**ASKED, "input": ["/a/right.mp4"]}, "capture")
+    assert folder.asked()["input"] == ["/a/right.mp4"]
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"asked": {}}', '{"asked": 1, "made": {}}', "\x00"])
 def test_a_broken_record_is_named(text: str, folder: CaptureFolder) -> None:
+    filled(folder, "a")
     folder.record_path.write_text(text)
     refuses(CAPTURE_RECORD_FILE, folder.claim, ASKED, "capture", overwrite=True)
     assert folder.record_path.read_text() == text

@@ -41,6 +41,7 @@ def test_a_capture_of_somebody_is_no_demos(tmp_path):
     folder = CaptureFolder(tmp_path, "photos")
     asked = {"input": ["/a/photos"], "iterations": 30}
     folder.claim(asked, "capture")
+    (tmp_path / "run").mkdir()
     refuses("was made with input /a/photos, not with demo 40; choose another folder$", demo.claim, folder, 30)
     assert folder.asked() == asked
 
