@@ -74,14 +74,18 @@ class CaptureFolder:
             more = ", or give --overwrite to replace it" if verb == "capture" else ""
             raise InputError(f"{self.path}: was made with {was}, not with {now}; choose another folder{more}")
         if overwrite:
-            self._write(asked, {} if record["asked"] == asked else record["made"])
+            again = record["asked"] == asked
+            self._write(asked, dict.fromkeys(record["made"], "") if again else record["made"])
 
     def begin(self, stage: str, source: str) -> None:
         """Remove the results of a stage unless they were made from `source`, a text that identifies the stage's input.
 
-        capture.json records `source` before the stage makes its results.
+        capture.json records `source` before the stage makes its results. Raises InputError for results of a stage that
+        capture.json does not record.
         """
-        record = self._read()
+        record, result = self._read(), self.results[stage]
+        if stage not in record["made"] and (result.exists() or result.is_symlink()):
+            raise InputError(f"{result}: was not made by this capture; choose another folder, or remove it")
         if record["made"].get(stage) != source:
             self._remove(stage)
             self._write(record["asked"], {**record["made"], stage: source})

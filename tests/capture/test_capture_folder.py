@@ -110,6 +110,12 @@ def test_files_of_others_in_a_run_stay(folder: CaptureFolder) -> None:
     assert {name for name in files_of(folder) if name.startswith("run/")} == {"run/notes.txt"}
 
 
+def test_results_that_come_from_elsewhere_are_not_removed(folder: CaptureFolder) -> None:
+    folder.scene.mkdir()
+    refuses("scene: was not made by this capture; choose another folder", folder.begin, "cameras", "a")
+    assert folder.scene.is_dir()
+
+
 def test_a_call_without_results_can_be_mended(folder: CaptureFolder) -> None:
     folder.begin("frames", "a")
     folder.claim({**ASKED, "input": ["/a/right.mp4"]}, "capture")
