@@ -23,9 +23,8 @@ from walk_videos import Walk, walk, write_walk
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.images.video import frame_planes, prores_planes, video_writer
-from clsplat.scenes.video import frames as video_frames
 from clsplat.scenes.video.choice import choose
-from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, take_frames
+from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, measure_video, take_frames
 from clsplat.scenes.video.reading import open_video, parse_place
 
 require("av")
@@ -70,7 +69,7 @@ def test_a_walk_with_stops_and_a_fast_turn(name: str, made: Walk, videos: dict[s
     assert {made.parts[index] for index in chosen} == {"stop", "walk"}  # none from the turn
     assert sum(made.parts[index] == "stop" for index in chosen) <= 4  # two stops take a quarter of the time
     with open_video(videos[name]) as reader:
-        measured, _, _ = video_frames._measured(reader, lambda _: None)
+        measured, _, _ = measure_video(reader, lambda _: None)
     choice = choose(measured, 12)
     assert choice.frames.tolist() == chosen
     for index in chosen:

@@ -99,7 +99,7 @@ def test_videos_and_photographs_in_one_folder_are_several_cameras(
     groups = [{name.rpartition("/")[0] for name in group} for group in task["groups"]]
     assert sorted(map(sorted, groups)) == [[""], ["more/Walk.MOV"], ["walk.mp4"]]
     assert [len(names) for names in task["sequences"]] == [4, 4]
-    assert any("1 photo(s) (LIVE.mov) left out: a photograph has the same name" in text for text in messages)
+    assert any("1 video(s) (LIVE.mov) left out: a photograph has the same name" in text for text in messages)
     # the output is inside the folder: neither its frames nor its photographs are found next time
     sfm.reconstruct(folder, folder / "scene", frames=4)
     assert len(tasks) == 1

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
+from hostile_videos import make_frames, make_video, read_frames, read_video
 from ksplats import ksplat
 from models import random_gaussians
 from other_pictures import KINDS, other_picture
@@ -40,6 +41,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct
+from clsplat.scenes.video.frames import FRAME_TABLE_FILE
 from clsplat.shots.read import choose_shot
 from clsplat.training import repro_bundle
 
@@ -441,6 +443,8 @@ _ALL = (
     _one_file("bundle", "trouble-step-0000007.npz", make_bundle, repro_bundle.read_bundle, ARCHIVE, 2),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), BINARY, 1),
     Reader("record", make_record, read_record, ("sfm.json",), DOCUMENT, 1),
+    *(Reader("video", make_video, read_video, ("walk.mp4",), BINARY, 1) for _ in range(bool(find_spec("av")))),
+    Reader("frames", make_frames, read_frames, (f"frames/{FRAME_TABLE_FILE}",), DOCUMENT, 1),
     *(
         _saved(name, TEXT if name == "model.compressed.ply" else BINARY)
         for name in ("model.splat", "model.compressed.ply", "model.spz", "model.sog", "model.glb")

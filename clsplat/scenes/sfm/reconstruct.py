@@ -29,6 +29,7 @@ from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
+from clsplat.scenes.video.reading import is_video_name
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 
@@ -144,7 +145,8 @@ def reconstruct(
     _require_enough(images, len(paths) + len(videos.paths))
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
-        warn(f"{images}: {_listed(names)} left out: {why}")
+        kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
+        warn(f"{images}: {_listed(names, kind)} left out: {why}")
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -452,6 +454,6 @@ def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     )
 
 
-def _listed(names: list[str]) -> str:
+def _listed(names: list[str], kind: str = "photo(s)") -> str:
     """Return text such as "3 photo(s) (a.jpg, b.jpg, c.jpg)", shortened if there are many names."""
-    return f"{len(names):,} photo(s) ({examples(names)})"
+    return f"{len(names):,} {kind} ({examples(names)})"

@@ -145,6 +145,8 @@ def find_videos(folder: Path, excluded: Collection[Path] = ()) -> tuple[list[Pat
         stills = {Path(name).stem.casefold() for name in files if Path(name).suffix.lower() in kinds}
         for name in files:
             if not name.startswith(".") and is_video_name(Path(name)):
+                if not name.isprintable():
+                    raise InputError(f"{here / name}: its name has unprintable characters; rename it")
                 (moving if Path(name).stem.casefold() in stills else videos).append(here / name)
     key = lambda path: photo_name(folder, path)  # noqa: E731  # shorter than a function for two uses
     why = "a photograph has the same name, as with moving photographs; rename the video to use it"

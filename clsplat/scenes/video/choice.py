@@ -62,25 +62,25 @@ class Choice:
 def choose(measured: Measurements, count: int | None = None) -> Choice:
     """Choose frames of a video. count: number of frames; None for a number by length and motion.
 
-    The camera's way is divided into `count` stretches of equal motion, so that a camera that stands still gives one
+    The camera's path is divided into `count` stretches of equal motion, so that a camera that stands still gives one
     frame. If there are no more usable frames than `count`, each is a stretch. The sharpest frame of each stretch is
     chosen. It is looked for in the stretch's middle half, if one there is sharper than the stretch's median. Fast,
     blurred and damaged frames are left out, and of two alike frames in a row the less sharp one.
     """
     fast, blurred = fast_frames(measured), blurred_frames(measured)
-    way = travelled(measured, fast)
-    total = float(way[-1])
+    path = travelled(measured, fast)
+    total = float(path[-1])
     wanted = count if count is not None else default_count(total, measured.seconds[-1], len(measured))
     usable = measured.whole & ~fast & ~blurred
     if wanted >= usable.sum():
         stretches = np.arange(len(measured))
     else:
-        stretches = np.minimum((way / max(total, 1e-9) * wanted).astype(np.int64), wanted - 1)
+        stretches = np.minimum((path / max(total, 1e-9) * wanted).astype(np.int64), wanted - 1)
     stretches[fast] = -1
     chosen = []
     for number in np.unique(stretches[~fast]):
         inside = np.flatnonzero(stretches == number)
-        if (best := _sharpest(measured.sharpness, way, inside, usable)) is not None:
+        if (best := _sharpest(measured.sharpness, path, inside, usable)) is not None:
             chosen.append(best)
     kept = unlike(chosen, measured)
     return Choice(
@@ -89,7 +89,7 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
 
 
 def default_count(total: float, seconds: float, frames: int) -> int:
-    """Return the number of frames for a way of `total` longer sides and a length in seconds."""
+    """Return the number of frames for a path of `total` longer sides and a video of some seconds."""
     by_motion = min(max(total / MOTION_PER_FRAME, seconds * MIN_FRAMES_PER_SECOND), MAX_DEFAULT_FRAMES)
     return int(max(1, min(round(by_motion), frames)))
 
@@ -120,12 +120,12 @@ def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
 
 
 def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
-    """Return the way (F,) of the camera up to each frame, in longer sides, without that of fast frames.
+    """Return the length (F,) of the camera's path up to each frame, in longer sides, without fast frames.
 
-    It is the length of a path of steps of at least MOTION_STEP: motion by blocks is summed with its signs, and counts
-    when its mean length reaches a step.
+    The path has steps of at least MOTION_STEP: the motion of each block is summed as a vector, and counts when the mean
+    length of the sums reaches a step.
     """
-    way, done, step = np.zeros(len(measured)), 0.0, np.zeros_like(measured.flow[0])
+    path, done, step = np.zeros(len(measured)), 0.0, np.zeros_like(measured.flow[0])
     for index in range(1, len(measured)):
         flow = measured.flow[index]
         matched = np.isfinite(flow[:, 0])
@@ -134,11 +134,11 @@ def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
             length = float(np.linalg.norm(step, axis=1).mean())
             if length >= MOTION_STEP:
                 done, step = done + length, np.zeros_like(step)
-        way[index] = done
-    return way
+        path[index] = done
+    return path
 
 
-def _sharpest(sharpness: Float64, way: Float64, inside: NDArray[np.int64], usable: NDArray[np.bool_]) -> int | None:
+def _sharpest(sharpness: Float64, path: Float64, inside: NDArray[np.int64], usable: NDArray[np.bool_]) -> int | None:
     """Return the usable frame of a stretch to choose, None if there is none.
 
     inside: indices of the stretch's frames.
@@ -147,8 +147,8 @@ def _sharpest(sharpness: Float64, way: Float64, inside: NDArray[np.int64], usabl
     if not len(able):
         return None
     best = int(able[sharpness[able].argmax()])
-    low, high = way[inside[0]], way[inside[-1]]
-    middle = able[np.abs(way[able] - (low + high) / 2) <= (high - low) / 4]
+    low, high = path[inside[0]], path[inside[-1]]
+    middle = able[np.abs(path[able] - (low + high) / 2) <= (high - low) / 4]
     if not len(middle):
         return best
     central = int(middle[sharpness[middle].argmax()])

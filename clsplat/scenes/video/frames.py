@@ -208,8 +208,8 @@ def _size(path: Path) -> int:
 def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress: Progress) -> dict[str, Any]:
     """Write the chosen frames of one video below `folder`. Returns the video's part of the table."""
     with open_video(path) as reader:
-        measured, numbers, turns = _measured(reader, lambda done: progress(f"reading {name}", done))
-        facts = reader.facts
+        measured, numbers, turns = measure_video(reader, lambda done: progress(f"reading {name}", done))
+        facts = reader.facts.turned(turns)
         _check(path, reader, measured)
     choice = choose(measured, count)
     if not len(choice.frames):
@@ -223,11 +223,11 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
     files = {numbers[row]: f"{name}/{numbers[row]:06d}.jpg" for row in choice.frames.tolist()}
     (folder / name).mkdir(parents=True)
     with open_video(path) as reader:
-        _write(reader, folder, files, turns, lambda done: progress(f"writing the frames of {name}", done))
+        _write(reader, facts, folder, files, turns, lambda done: progress(f"writing the frames of {name}", done))
     return {**_described(facts, turns), **_listed(folder, files, measured, choice, numbers), **_told(told)}
 
 
-def _measured(reader: VideoReader, report: Callable[[float], None]) -> tuple[Measurements, list[int], int]:
+def measure_video(reader: VideoReader, report: Callable[[float], None]) -> tuple[Measurements, list[int], int]:
     """Measure all frames. Returns the measurements, the number of each measured frame, and the frames' quarter turns.
 
     Frames of another size than the first one's are left out.
@@ -274,10 +274,15 @@ def _check(path: Path, reader: VideoReader, measured: Measurements) -> None:
 
 
 def _write(
-    reader: VideoReader, folder: Path, files: dict[int, str], turns: int, report: Callable[[float], None]
+    reader: VideoReader,
+    facts: VideoFacts,
+    folder: Path,
+    files: dict[int, str],
+    turns: int,
+    report: Callable[[float], None],
 ) -> None:
     """Decode a video up to the last chosen frame, and write the chosen frames. files: names by number of the frame."""
-    facts, last = reader.facts, max(files)
+    last = max(files)
     waiting: deque[Future[None]] = deque()
     workers = min(4, os.cpu_count() or 1)
     done = 0
@@ -320,10 +325,9 @@ def write_frame(path: Path, pixels: NDArray[np.uint8], make: str = "", model: st
 
 def _described(facts: VideoFacts, turns: int) -> dict[str, Any]:
     """Return a video's facts for the table; facts that the file lacks are left out."""
-    width, height = (facts.height, facts.width) if turns % 2 else (facts.width, facts.height)
     known: dict[str, Any] = {
-        "width": width,
-        "height": height,
+        "width": facts.width,
+        "height": facts.height,
         "turned": 90 * turns,
         "codec": facts.codec,
         "range": facts.coding.label,

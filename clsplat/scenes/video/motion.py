@@ -37,13 +37,20 @@ _LOW_PASS_CYCLES = 0.2
 
 def reduced_luma(luma: NDArray[np.unsignedinteger[Any]], side: int) -> NDArray[np.uint32]:
     """Sum luma (H, W) over squares, so that the longer side has at most `side` pixels. Sums are exact integers."""
-    factor = -(-max(luma.shape) // side)
-    height, width = (length // factor for length in luma.shape)
-    cut = luma[: height * factor, : width * factor]
-    down = cut[0::factor].astype(np.uint32)
+    return np.asarray(_summed(luma, -(-max(luma.shape) // side), np.uint32), np.uint32)
+
+
+def _summed(image: NDArray[Any], factor: int, dtype: type[np.generic]) -> NDArray[Any]:
+    """Sum an image (H, W) over squares of `factor` pixels a side, without the rest at its right and lower edges.
+
+    Slices are added one by one, because NumPy's sums over short axes take several times as long.
+    """
+    height, width = (length // factor for length in image.shape)
+    cut = image[: height * factor, : width * factor]
+    down = cut[0::factor].astype(dtype)
     for row in range(1, factor):
         down += cut[row::factor]
-    total = down[:, 0::factor].astype(np.uint32)
+    total = np.array(down[:, 0::factor])
     for column in range(1, factor):
         total += down[:, column::factor]
     return total
@@ -118,10 +125,9 @@ class Meter:
 
 
 def _averaged(grey: Float32, side: int) -> Float32:
+    """Average a picture (H, W) over squares, so that the longer side has at most `side` pixels."""
     factor = -(-max(grey.shape) // side)
-    height, width = (length // factor for length in grey.shape)
-    cut = grey[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    return np.asarray(cut.mean(axis=(1, 3), dtype=np.float32))
+    return np.asarray(_summed(grey, factor, np.float32) * np.float32(1 / factor**2), np.float32)
 
 
 def _motion(flow: Float64, textured: Float64) -> Float64:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ SD_HEIGHT_PX = 576
 """Largest height in pixels of a video whose colours are Rec.601 if the file does not name a matrix."""
 MIN_VIDEO_SIDE_PX = 32
 """Smallest side in pixels of a video whose motion can be measured."""
+MAX_VIDEO_PIXELS = 1 << 27
+"""Largest number of pixels of a video's frame: 16384 x 8192. A decoder keeps several frames in memory."""
 
 _ISO6709 = re.compile(r"([+-]\d+(?:\.\d*)?)([+-]\d+(?:\.\d*)?)([+-]\d+(?:\.\d*)?)?(?:CRS[^/]*)?/?\s*\Z")
 _PLACE_KEYS = ("com.apple.quicktime.location.ISO6709", "location", "location-eng")
@@ -45,7 +47,7 @@ def is_video_name(path: Path) -> bool:
 class VideoFacts:
     """Facts from the header of a video.
 
-    width, height: size in pixels as stored, before the rotation that the file asks for.
+    width, height: size in pixels, as stored or as `turned` says.
     seconds: length by the header; None if the header does not have it.
     frames: number of frames by the header; 0 if the header does not have it.
     codec: FFmpeg's name of the codec.
@@ -64,6 +66,12 @@ class VideoFacts:
     time: str = ""
     make: str = ""
     model: str = ""
+
+    def turned(self, quarter_turns: int) -> VideoFacts:
+        """Return the facts with the size of the picture after quarter turns."""
+        if quarter_turns % 2 == 0:
+            return self
+        return replace(self, width=self.height, height=self.width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +175,10 @@ def _prepared(path: Path, stream: Any) -> Any:
         raise InputError(
             f"{path}: its pictures are {context.width}x{context.height}, expected at least {MIN_VIDEO_SIDE_PX} pixels "
             "a side"
+        )
+    if context.width * context.height > MAX_VIDEO_PIXELS:
+        raise InputError(
+            f"{path}: its pictures are {context.width}x{context.height}, expected at most {MAX_VIDEO_PIXELS:,} pixels"
         )
     context.thread_type = "AUTO"
     return stream
