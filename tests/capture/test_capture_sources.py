@@ -17,6 +17,8 @@ from clsplat.capture.folder import CaptureFolder
 from clsplat.capture.sources import check_sources, photographs_of
 from clsplat.images.writing import write_image
 from clsplat.progress import no_progress
+from clsplat.scenes.sfm.photos import Photo, camera_groups
+from clsplat.scenes.sfm.video_frames import frames_of_videos
 
 require("av")
 
@@ -55,6 +57,20 @@ def test_several_videos_have_folders_below_their_common_one(videos: Path, tmp_pa
         "a/walk.mp4",
         "b/walk.mp4",
     }
+
+
+def test_each_video_of_a_folder_of_frames_has_a_camera(videos: Path, tmp_path: Path) -> None:
+    folder = CaptureFolder(tmp_path)
+    photographs_of([videos / name / "walk.mp4" for name in ("a", "b")], folder, 4, no_progress)
+    names = [path.relative_to(folder.frames).as_posix() for path in folder.frames.rglob("*.jpg")]
+    photos = [Photo(name, 64, 48, ("", "", "")) for name in (*names, "photo.jpg")]
+    found = frames_of_videos(folder.frames, folder.scene, None, no_progress)
+    groups = camera_groups(found.by_video(photos), "auto")
+    assert sorted(sorted({name.rpartition("/")[0] for name in group}) for group in groups) == [
+        [""],
+        ["a/walk.mp4"],
+        ["b/walk.mp4"],
+    ]
 
 
 def test_photographs_and_videos_in_a_folder(videos: Path, tmp_path: Path) -> None:
