@@ -89,8 +89,9 @@ class CaptureProgress(LiveBar):
                     print(self._line(text, fraction, detail), file=sys.stderr, flush=True)
                 self._told, self._told_at = key, now
         elif key != self._told or now - self._told_at >= LIVE_TEXT_SECONDS:
-            spent = now - self._began
-            share = spent / max(spent + self.left(), 1e-9)
+            if fraction is None:  # a finding, such as the number of a video's frames, stays readable above the bar
+                self.live.console.print(f"{self.stage_name}: {text}", markup=False, highlight=False, soft_wrap=True)
+            share = (now - self._began) / max(now - self._began + self.left(), 1e-9)
             line = self._line(text, fraction, detail)
             self.live.update(self.task, completed=BAR_STEPS * share, description=line)
             self._told, self._told_at = key, now

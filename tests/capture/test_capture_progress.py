@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import errno
+import io
 from collections.abc import Iterator
+from contextlib import redirect_stderr
 
 import pytest
 from calls import Capture
@@ -106,6 +108,23 @@ def test_lines_say_stage_part_and_time(clock: Clock, capsys: Capture) -> None:
         progress("counted", 0.25, " 1 of 4")
     lines = ["4/4 report: writing  about 0:05 left", "4/4 report: writing 100 %  about 0:00 left"]
     assert capsys.readouterr().err.splitlines()[:2] == lines
+
+
+def test_a_bar_on_a_terminal_and_findings_above_it() -> None:
+    class TerminalText(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    stream = TerminalText()
+    with redirect_stderr(stream), CaptureProgress(EXPECTED, "again") as progress:
+        with progress.stage("frames"):
+            progress("walk.mp4: 31 of 160 frames chosen")
+            progress("writing the frames", 0.5)
+            assert progress.live is not None
+            (task,) = progress.live.tasks
+            assert task.description.startswith("1/4 frames: writing the frames 50 %  about ")
+            assert 0 <= task.completed <= task.total
+    assert "frames: walk.mp4: 31 of 160 frames chosen" in stream.getvalue()
 
 
 @pytest.mark.parametrize(
