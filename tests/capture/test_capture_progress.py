@@ -116,14 +116,13 @@ def test_a_bar_on_a_terminal_and_findings_above_it() -> None:
             return True
 
     stream = TerminalText()
-    with redirect_stderr(stream), CaptureProgress(EXPECTED, "again") as progress:
-        with progress.stage("frames"):
-            progress("walk.mp4: 31 of 160 frames chosen")
-            progress("writing the frames", 0.5)
-            assert progress.live is not None
-            (task,) = progress.live.tasks
-            assert task.description.startswith("1/4 frames: writing the frames 50 %  about ")
-            assert 0 <= task.completed <= task.total
+    with redirect_stderr(stream), CaptureProgress(EXPECTED, "again") as progress, progress.stage("frames"):
+        progress("walk.mp4: 31 of 160 frames chosen")
+        progress("writing the frames", 0.5)
+        assert progress.live is not None
+        (task,) = progress.live.tasks
+        assert task.description.startswith("1/4 frames: writing the frames 50 %  about ")
+        assert 0 <= task.completed <= task.total
     assert "frames: walk.mp4: 31 of 160 frames chosen" in stream.getvalue()
 
 
