@@ -105,12 +105,14 @@ def reconstruct(
     overwrite: bool = False,
     masks: MaskUse | None = None,
     frames: int | None = None,
+    frames_to: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
 
     images: a folder with photographs, videos or both; or a video. Frames of videos are written to a folder beside the
-        output (`video_frames.frames_folder`), and used like photographs.
+        output (`video_frames.frames_folder`), and used like photographs. A folder that `take_frames` wrote counts as
+        the videos.
 
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
     folder is created when all files are complete. An existing result for the same photographs and settings is reused.
@@ -120,6 +122,7 @@ def reconstruct(
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
     frames: number of frames of each video; None for a number by its length and motion.
+    frames_to: folder for the frames; None for a folder beside the output.
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
@@ -131,7 +134,7 @@ def reconstruct(
     """
     report = progress or no_progress
     settings.check()
-    videos = frames_of_videos(images, output, frames, report, overwrite=overwrite)
+    videos = frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to)
     paths, left_out = videos.photos_beside(images, output)
     copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
     paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
@@ -201,6 +204,7 @@ def _staged_photos(
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
         again = f"{count} and left out ({sfm_copies.listed(copies)}); to use the copies instead, give only their folder"
         warn(f"{images}: {again}")
+    photos = videos.by_video(photos)
     photos += videos.staged(target, lambda fraction: report("reading frames", fraction), threads)
     _require_enough(images, len(photos))
     return photos

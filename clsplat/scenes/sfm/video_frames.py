@@ -66,27 +66,43 @@ class VideoFrames:
         """Return the photographs beside the videos, and the files that are left out, as `find_photos` does."""
         if not images.is_dir():
             return [], {}
-        photos, left_out = find_photos(images, (output, frames_folder(output)), needed=not self.paths)
+        photos, left_out = find_photos(images, (output, self.folder), needed=not self.paths)
         return photos, {**left_out, **self.left_out}
 
     def staged(self, target: Path, report: Callable[[float], None], threads: int) -> list[Photo]:
         """Put the frames under `target`, as `stage_photos` does. Frames of one video share a camera with no others."""
         if not self.paths:
             return []
+        return self.by_video(stage_photos(self.folder, self.paths, target, report, threads))
+
+    def by_video(self, photos: list[Photo]) -> list[Photo]:
+        """Return photographs with the number of their video in the lens, by which frames of one video share a camera.
+
+        Photographs that are not frames of `sequences` stay as they are.
+        """
         video_of = {name: str(number) for number, names in enumerate(self.sequences) for name in names}
-        staged = stage_photos(self.folder, self.paths, target, report, threads)
-        return [replace(photo, lens=(*photo.lens, "video", video_of[photo.name])) for photo in staged]
+        return [
+            replace(photo, lens=(*photo.lens, "video", video_of[photo.name])) if photo.name in video_of else photo
+            for photo in photos
+        ]
 
 
 def frames_of_videos(
-    images: Path, output: Path, count: int | None, progress: Progress, *, overwrite: bool
+    images: Path,
+    output: Path,
+    count: int | None,
+    progress: Progress,
+    *,
+    overwrite: bool = False,
+    folder: Path | None = None,
 ) -> VideoFrames:
     """Take the frames of a video, or of all videos below a folder of photographs.
 
     output: folder for the cameras. count, overwrite: as for `take_frames`.
+    folder: folder for the frames; by default `frames_folder(output)`.
     Raises InputError for a file that is not a video, and if `take_frames` does.
     """
-    folder = frames_folder(output)
+    folder = folder or frames_folder(output)
     videos = [images]
     parts: dict[str, list[Path]] = {}
     if images.is_dir():
