@@ -33,7 +33,7 @@ class SelftestVerb(Verb):
 
     The exit status is 1 if a driver cannot be trusted. The verbs train, eval, render, view, bench, capture and demo run
     a short form of this test when they first use a device. So does convert, if it renders. CLSPLAT_TRUST_DRIVER=1 skips
-    the short form. This verb tests a device's preferred kernel shape even if its driver has failed in this shape before.
+    the short form. This verb tests a device's preferred kernel shape even if its driver failed in this shape before.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"
