@@ -108,7 +108,11 @@ def test_every_pose_is_recovered(scene, pictures):
     assert record["photos"] == len(record["registered"]) == COUNT
     assert record["mean_reprojection_error"] < 0.5
     stages = list(dict.fromkeys(text for text, _ in heard))
-    assert stages == ["reading photos", "finding features", "matching photos", "placing cameras", "undistorting photos"]
+    matched = ["choosing pairs", "matching photos"]
+    assert stages == ["reading photos", "finding features", *matched, "placing cameras", "undistorting photos"]
+    assert (record["matching"], record["pairs"]) == ("exhaustive", COUNT * (COUNT - 1) // 2)
+    assert (record["mapper"], record["features"], record["fragments"]) == ("incremental", "sift", [])
+    assert {"features", "pairs", "matches", "cameras", "undistorting"} == set(record["seconds"])
     placed = [fraction.text for text, fraction in heard if text == "placing cameras"]
     assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras placed", f"{COUNT} of {COUNT} cameras placed")
     assert len(placed) > 3  # they are counted as they come
@@ -146,20 +150,24 @@ def test_same_seed_same_bytes(scene, photos, tmp_path):
 
 
 @pytest.mark.parametrize(("count", "threads"), [(worker.MAX_SINGLE_THREAD_PHOTOS, 1), (81, 3)])
-def test_matching_and_mapping_of_few_photos_have_one_thread(count, threads, tmp_path, monkeypatch):
+@pytest.mark.parametrize("mapper", ["global", "incremental"])
+def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threads, tmp_path, monkeypatch):
     """With several threads the bytes differ in one of 70 runs on a busy machine, so that two equal runs show little."""
     names, given = [f"{index}.jpg" for index in range(count)], []
-    monkeypatch.setattr(
-        worker.pycolmap, "match_exhaustive", lambda **all_: given.append(all_["matching_options"].num_threads)
-    )
-    monkeypatch.setattr(
-        worker.pycolmap, "incremental_mapping", lambda **all_: given.append(all_["options"].num_threads) or {}
-    )
-    task = {"photos": tmp_path, "work": tmp_path, "groups": [names], "sequential": False, "threads": 3, "seed": 0}
-    work = worker.Worker(task, io.StringIO())
+    monkeypatch.setattr(worker.matching, "matched_pairs", lambda *_: ("retrieval", [(1, 2)]))
+    for name in ("match_image_pairs", "incremental_mapping", "calibrate_view_graph", "global_mapping"):
+        told = "matching_options" if name.startswith("match") else "options"
+        monkeypatch.setattr(worker.pycolmap, name, lambda told=told, **all_: given.append(all_[told]) or {})
+    monkeypatch.setattr(worker.matching.sfm_database, "image_names", lambda _: {})
+    monkeypatch.setattr(worker.matching.sfm_database, "rename_images", lambda *_: None)
+    settings = sfm.SfmSettings(mapper=mapper)
+    photos = [sfm_photos.Photo(name, 40, 30, ()) for name in names]
+    work = worker.Worker(sfm.sfm_task(settings, photos, [], tmp_path, 3), io.StringIO())
     work.match()
-    work.map(relaxed=False)
-    assert given == [threads, threads]
+    work.map()
+    assert {options.num_threads for options in given if hasattr(options, "num_threads")} == {threads}
+    if mapper == "global":
+        assert given[-1].mapper.num_threads == threads
 
 
 @pytest.mark.slow
@@ -259,7 +267,10 @@ def test_bad_folders(tmp_path, photos):
     for output, settings, told in [
         (tmp_path, {}, "is neither empty nor a result of sfm"),
         (tmp_path / "few/view_00.jpg", {}, "is a file"),
-        (tmp_path / "out", {"matching": "nearest"}, "expected auto, exhaustive or sequential"),
+        (tmp_path / "out", {"matching": "nearest"}, "expected one of auto, exhaustive, sequential, spatial, retrieval"),
+        (tmp_path / "out", {"mapper": "both"}, "mapper 'both': expected one of auto, global, incremental"),
+        (tmp_path / "out", {"features": "orb"}, "features 'orb': expected one of sift, aliked"),
+        (tmp_path / "out", {"weights": "w.onnx"}, "w.onnx: SIFT features have no weights, expected --features aliked"),
         (tmp_path / "out", {"camera_model": "LENS"}, "camera model 'LENS'"),
     ]:
         refuses(told, sfm.reconstruct, photos, output, sfm.SfmSettings(**settings))
@@ -282,12 +293,12 @@ def task_of(monkeypatch):
 
     def run(task, work, report):
         tasks.append(task)
-        return {"result": {"registered": sorted(name for group in task["groups"] for name in group)}}
+        return {"result": {"registered": sorted(name for group in task["groups"] for name in group), "fragments": []}}
 
     def move(work, output):
         tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
 
-    monkeypatch.setattr(sfm, "_run_worker", run)
+    monkeypatch.setattr(sfm, "run_worker", run)
     monkeypatch.setattr(sfm, "move_into_place", move)
 
     def stage(_images, _paths, target, *_):
@@ -417,7 +428,7 @@ def test_photos_with_masks_are_trained_by_their_folder(photos, tmp_path, monkeyp
     alpha = scene.views[0].load()[:, :, 3]
     assert not alpha[: HEIGHT // 4 - 6].any()
     assert alpha[HEIGHT // 4 + 6 :].all()
-    monkeypatch.setattr(sfm, "_run_worker", lambda *_: pytest.fail("reconstructed again"))
+    monkeypatch.setattr(sfm, "run_worker", lambda *_: pytest.fail("reconstructed again"))
     ignored = load_scene(folder, masks=MaskUse("ignore", invert=True)).views[0].load_masked()
     assert not ignored[: HEIGHT // 4 - 6, :, 4].any(), "the same features, so the same reconstruction"
 
