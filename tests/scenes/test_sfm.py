@@ -4,6 +4,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import sqlite3
 import sys
 
 import numpy as np
@@ -21,6 +22,7 @@ from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
 from clsplat.errors import ClsplatError, InputError
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.sfm import database as sfm_database
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.scenes.sfm import worker
@@ -147,6 +149,63 @@ def test_same_seed_same_bytes(scene, photos, tmp_path):
     again = sfm.reconstruct(photos, tmp_path / "again", PINHOLE, threads=3)
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (again / "sparse/0" / name).read_bytes() == (scene[0] / "sparse/0" / name).read_bytes(), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "choice", [{"mapper": "global"}, {"matching": "retrieval"}, {"matching": "sequential"}, {"matching": "exhaustive"}]
+)
+def test_every_choice_gives_the_same_bytes_twice(choice, photos, tmp_path):
+    settings = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE", **choice)
+    scenes = [sfm.reconstruct(photos, tmp_path / str(threads), settings, threads=threads) for threads in (1, 3)]
+    record = json.loads((scenes[0] / sfm.SFM_RECORD_FILE).read_text())
+    assert len(record["registered"]) == COUNT
+    assert record["mean_reprojection_error"] < 0.5
+    assert choice.items() <= record.items()
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert len({(scene / "sparse/0" / name).read_bytes() for scene in scenes}) == 1, name
+
+
+@pytest.mark.slow
+def test_photographs_of_two_things_are_two_models(pictures, tmp_path):
+    """Mirrored pictures match among themselves, and not with the others."""
+    for index, picture in enumerate(pictures[0]):
+        write_image(tmp_path / f"photos/a {index}.jpg", picture)  # names with spaces
+    for index, picture in enumerate(pictures[0][:6]):
+        write_image(tmp_path / f"photos/b {index}.jpg", picture[:, ::-1])
+    (message,) = warnings_of(lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", PINHOLE))
+    assert "6 photo(s) (b 0.jpg, b 1.jpg, b 2.jpg and 3 more) form a model of their own, with too few" in message
+    assert f"to the {COUNT} photo(s) that are used" in message
+    record = json.loads((tmp_path / "scene" / sfm.SFM_RECORD_FILE).read_text())
+    assert record["fragments"] == [[f"b {index}.jpg" for index in range(6)]]
+    assert len(record["registered"]) == COUNT
+
+
+def test_a_smaller_model_is_named(photos, tmp_path, monkeypatch):
+    def run(task, work, report):
+        (work / "result" / "images").mkdir(parents=True)
+        names = sorted(task["groups"][0])
+        return {"result": {"registered": names[:7], "fragments": [names[7:10], names[10:11]]}}
+
+    monkeypatch.setattr(sfm, "run_worker", run)
+    apart = "form a model of their own, with too few matches to the 7 photo(s) that are used; to join both, add photos"
+    messages = warnings_of(lambda: sfm.reconstruct(photos, tmp_path / "out"))
+    assert [message.split(": ", 1)[1] for message in messages] == [
+        f"3 photo(s) (view_07.jpg, view_08.jpg, view_09.jpg) {apart} in between",
+        f"1 photo(s) (view_10.jpg) {apart} in between",
+        "no camera pose was found for 1 photo(s) (view_11.jpg), which will not be used",
+    ]
+
+
+def test_names_with_spaces_and_of_numbers_keep_their_features(tmp_path):
+    with sqlite3.connect(tmp_path / "a.db") as connection:
+        connection.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE)")
+        connection.executemany("INSERT INTO images VALUES (?, ?)", [(1, "a b.jpg"), (2, "1"), (3, "3")])
+    names = sfm_database.image_names(tmp_path / "a.db")
+    sfm_database.rename_images(tmp_path / "a.db", {image: str(image) for image in names})
+    assert sfm_database.image_names(tmp_path / "a.db") == {1: "1", 2: "2", 3: "3"}
+    sfm_database.rename_images(tmp_path / "a.db", names)
+    assert sfm_database.image_names(tmp_path / "a.db") == names
 
 
 @pytest.mark.parametrize(("count", "threads"), [(worker.MAX_SINGLE_THREAD_PHOTOS, 1), (81, 3)])
