@@ -26,7 +26,7 @@ class SfmVerb(Verb):
     output: Output
     """Folder for the scene."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
-    """Place one camera after another, or all at once. auto: one after another."""
+    """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed."""
     features: Literal["sift", "aliked"] = "sift"
     """Features to match. aliked: features of a neural network, which needs the extra `learned`."""
     weights: Annotated[str | None, arg(metavar="PATH")] = None

@@ -57,7 +57,7 @@ class SfmSettings:
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
     mapper: "incremental" adds one photograph after another. "global" solves for all cameras at once. "auto" is
-        "incremental".
+        "incremental", and "global" where that places less than 60 % of the photographs.
     features: "sift", or "aliked", learned features.
     weights: for "aliked" the file of the network, or a name in `weights.WEIGHTS_BY_NAME`; None for the default name.
     seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.

@@ -39,7 +39,7 @@ machine. Verification of the matches has a thread of its own.
 GLOBAL_FOLDER = "sparse-global"
 """Folder in the worker's folder for the models of the global mapper."""
 MIN_PLACED_FRACTION = 0.6
-"""Fraction of the photographs below which mapping is repeated with lower thresholds."""
+"""Fraction of the photographs below which mapping is repeated in another way."""
 
 
 class Worker:
@@ -138,21 +138,35 @@ class Worker:
         return chosen, len(pairs)
 
     def map(self) -> mapping.Models:
-        """Recover camera poses and points. Returns all models."""
-        if self.task["mapper"] == "global":
-            self.begin("cameras at once", None)
-            return mapping.global_models(
-                self.database,
-                self.photos,
-                self.work / GLOBAL_FOLDER,
-                threads=self.reproducible_threads,
-                seed=self.task["seed"],
-            )
-        models = self.add_one_by_one(relaxed=False)
-        if max((model.num_reg_images() for model in models.values()), default=0) < MIN_PLACED_FRACTION * self.count:
-            # The cameras may be close together, or there may be few features: try again with lower thresholds.
+        """Recover camera poses and points. Returns all models.
+
+        "auto" adds one photograph after another. If few are placed, as after a bad first pair, it solves for
+        all at once. If that places few, too, the cameras may be close together, or there may be few features, and
+        photographs are added with lower thresholds.
+        """
+        choice = self.task["mapper"]
+        models = {} if choice == "global" else self.add_one_by_one(relaxed=False)
+        if choice == "global" or (choice == "auto" and self.places_few(models)):
+            models |= self.solve_at_once()
+        if choice != "global" and self.places_few(models):
             models |= self.add_one_by_one(relaxed=True)
         return models
+
+    def places_few(self, models: mapping.Models) -> bool:
+        """Return True if the largest model has less than MIN_PLACED_FRACTION of the photographs."""
+        most = max((model.num_reg_images() for model in models.values()), default=0)
+        return most < MIN_PLACED_FRACTION * self.count
+
+    def solve_at_once(self) -> mapping.Models:
+        """Recover models by global mapping."""
+        self.begin("cameras at once", None)
+        return mapping.global_models(
+            self.database,
+            self.photos,
+            self.work / GLOBAL_FOLDER,
+            threads=self.reproducible_threads,
+            seed=self.task["seed"],
+        )
 
     def add_one_by_one(self, *, relaxed: bool) -> mapping.Models:
         """Recover models by incremental mapping. relaxed: as in `mapping.incremental_models`."""
