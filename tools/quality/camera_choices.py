@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,13 @@ COLUMNS = {
 
 def settings_of(choice: str, seed: int) -> SfmSettings:
     """Return the settings of a choice such as "matching=exhaustive,mapper=global"; "auto" has the defaults."""
-    settings = SfmSettings(seed=seed)
+    changes: dict[str, Any] = {}
     for entry in filter(None, choice.replace("auto", "").split(",")):
         name, _, value = entry.partition("=")
         if name not in ("matching", "mapper", "features", "weights", "camera_model"):
             raise InputError(f"--choices {choice}: {name!r} is no setting, expected such as matching=exhaustive")
-        settings = replace(settings, **{name: value})
+        changes[name] = value
+    settings = SfmSettings(seed=seed, **changes)
     settings.check()
     return settings
 

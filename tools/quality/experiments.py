@@ -426,7 +426,7 @@ TOWNS = {
     "--own-block": {"action": "store_true", "help": "photographs of --towns count where they show their own block"},
     "--passes": _number(30, "passes through the photographs, if --iterations is 0"),
 }
-CAMERAS = {
+CAMERAS: dict[str, Any] = {
     "--choices": {"default": "auto", "help": "'matching=exhaustive,mapper=global;auto', with semicolons between"},
     "--threads": {"type": int, "help": "threads of `clsplat sfm`; one per core if not given"},
     "--psnr": {"action": "store_true", "help": "train each scene as well"},

@@ -140,12 +140,12 @@ def _visual_words(sample: NDArray[np.float32], seed: int) -> NDArray[np.float32]
 
 def _nearest_words(rows: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the index of the nearest visual word of each descriptor."""
-    return np.argmax(rows @ words.T - 0.5 * (words**2).sum(axis=1), axis=1)
+    return np.asarray(np.argmax(rows @ words.T - 0.5 * (words**2).sum(axis=1), axis=1), np.int64)
 
 
 def _unit(rows: NDArray[Any]) -> NDArray[Any]:
     """Return the vectors along the last axis, scaled to length 1. Zero vectors stay zero."""
-    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
 
 
 def _sorted(pairs: Iterable[Pair]) -> list[Pair]:
