@@ -29,8 +29,16 @@ class SfmVerb(Verb):
     frames: OptionalInt = None
     """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: by
     length and motion, at most 300."""
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match every pair of photos, or only neighbours in name order (for video). auto: every pair up to 100 photos."""
+    mapper: Literal["auto", "global", "incremental"] = "auto"
+    """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed."""
+    features: Literal["sift", "aliked"] = "sift"
+    """Features to match. aliked: features of a neural network, which needs the extra `learned`."""
+    weights: Annotated[str | None, arg(metavar="PATH")] = None
+    """Network of --features aliked: an ONNX file, or a name to fetch, aliked-n16rot or aliked-n32. If not given:
+    aliked-n16rot. If it cannot be fetched within 30 seconds, SIFT features are used."""
+    matching: Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"] = "auto"
+    """Pairs of photos to match: all, neighbours in name order or in a video, the nearest by GPS, or the most similar.
+    auto: all up to 40 photos, neighbours and similar frames of videos, near photos with GPS, else similar photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
     """Lens model to fit, by COLMAP's name. The scene's images are undistorted with it. auto: OPENCV for a camera with
     20 photos or more, else SIMPLE_RADIAL."""
@@ -70,7 +78,14 @@ def run(verb: SfmVerb, services: Services) -> int:
     services.reconstruct(
         verb.photos,
         verb.output,
-        SfmSettings(matching=verb.matching, camera_model=verb.camera_model, seed=verb.seed),
+        SfmSettings(
+            matching=verb.matching,
+            camera_model=verb.camera_model,
+            seed=verb.seed,
+            mapper=verb.mapper,
+            features=verb.features,
+            weights=verb.weights,
+        ),
         threads=verb.threads,
         overwrite=verb.overwrite,
         masks=masks,

@@ -75,6 +75,7 @@ NEEDS = {
         "readers from npm", "apt-get install nodejs npm && python3 tests/support/node.py", lambda: bool(node_modules())
     ),
     "oclgrind": Need("Oclgrind", "apt-get install oclgrind", lambda: shutil.which("oclgrind") is not None),
+    "onnxruntime": of_extra("onnxruntime", "onnxruntime", "learned"),
     "openjd": Need("openjd-cli", "python3 tools/environment.py dev", lambda: bool(openjd_path())),
     "pillow_heif": of_extra("pillow_heif", "pillow-heif", "photos"),
     "playwright": of_extra("playwright", "Playwright", "test"),
