@@ -11,6 +11,8 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
+
 from clsplat.api import train
 from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
@@ -27,6 +29,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.shots.generated import turntable
 
@@ -62,7 +65,8 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
         gaussians, renderer = Gaussians.load(run.model_path), Renderer(opened)
         turntable_folder = output / "turntable"
         turntable_folder.mkdir(exist_ok=True)
-        for index, camera in enumerate(turntable([view.camera for view in scene.views], TURNTABLE_FRAME_COUNT)):
+        cameras, up = [view.camera for view in scene.views], np.array(COLMAP_UP) if scene.frame.upright else None
+        for index, camera in enumerate(turntable(cameras, TURNTABLE_FRAME_COUNT, up)):
             picture = renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image
             write_image(turntable_folder / f"frame_{index:03d}.png", picture)
             report("rendering the turntable", (index + 1) / TURNTABLE_FRAME_COUNT)

@@ -19,14 +19,17 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 from clsplat.config.masks import MaskUse
+from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import ClsplatError, InputError, examples, warn
 from clsplat.files.atomic import move_into_place
 from clsplat.files.documents import is_file
 from clsplat.process import apart
 from clsplat.progress import CountedFraction, Progress, no_progress
 from clsplat.scenes.camera_json import load_document
+from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.framing import set_frame
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -68,6 +71,8 @@ class SfmSettings:
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
     seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.
+    frame: how the frame of the result is set. By default a new result is turned upright, and an earlier one keeps its
+        frame. The cameras do not depend on it, so that an earlier result is used again in another frame.
     """
 
     matching: Matching = "auto"
@@ -76,6 +81,7 @@ class SfmSettings:
     max_image_size: int = 1600
     max_features: int = 8192
     seed: int = 0
+    frame: FrameUse = AS_IN_FILES
 
     def check(self) -> None:
         """Raise InputError for an unknown matching or camera model."""
@@ -83,6 +89,7 @@ class SfmSettings:
             raise InputError(f"matching {self.matching!r}: expected auto, exhaustive or sequential")
         if self.camera_model not in SFM_CAMERA_MODELS:
             raise InputError(f"camera model {self.camera_model!r}: expected one of {', '.join(SFM_CAMERA_MODELS)}")
+        self.frame.check()
 
     def __str__(self) -> str:
         """Return the values of the settings in one line, for the fingerprint of a result."""
@@ -105,8 +112,9 @@ def reconstruct(
 ) -> Path:
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
 
-    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
-    folder is created when all files are complete. An existing result for the same photographs and settings is reused.
+    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points; frame.json has the
+    transform from COLMAP's frame) and `sfm.json`. The folder is created when all files are complete. An existing result
+    for the same photographs and settings is reused.
 
     threads: number of CPU threads; None for one per core.
     overwrite: replace a result of other photographs.
@@ -130,6 +138,7 @@ def reconstruct(
     fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, shapes)}")
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
+        set_frame(output, images, settings.frame, output)
         return output
     _require_enough(images, len(paths))
     for why, others in left_out.items():
@@ -146,6 +155,7 @@ def reconstruct(
         answer = _run_worker(sfm_task(settings, photos, masked, work, workers), work, report)
         if "failure" in answer:
             raise InputError(_no_model(images, len(photos), answer["failure"]))
+        set_frame(work / "result", images, settings.frame.of_new_scene(), images)
         _write_record(work / "result", fingerprint, photos, answer["result"])
         _warn_of_losses(images, photos, answer["result"]["registered"], work / "result" / "images", masks)
         move_into_place(work, output)
@@ -330,7 +340,8 @@ def _sizes(result: Path) -> dict[str, int]:
     """Return the size in bytes of each file of a result. The keys are paths relative to the result."""
     folders = (result / "images", result / "sparse", result / "masks")
     paths = (path for folder in folders for path in folder.rglob("*"))
-    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
+    files = [path for path in sorted(paths) if path.name != FRAME_RECORD_FILE and is_file(path)]
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in files}
 
 
 def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
