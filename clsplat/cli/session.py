@@ -81,7 +81,7 @@ def load_scene(
         lenses=lenses,
         missing=missing,
         progress=StageProgress(),
-        **({} if frame is AS_IN_FILES else {"frame": frame}),
+        **({"frame": frame} if frame else {}),
     )
     for text in scene.warnings:
         warn(text)

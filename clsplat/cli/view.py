@@ -142,6 +142,7 @@ def _scene(services: Services, path: Path | None, run: Run | None, *, given: boo
     if path is None:
         return None
     config = run.config if run else TrainConfig()
+    frame = AS_IN_FILES if run is None else run.frame_for(path)
     try:
         return services.load_scene(
             path,
@@ -151,7 +152,7 @@ def _scene(services: Services, path: Path | None, run: Run | None, *, given: boo
             masks=config.mask_use,
             lenses=config.lenses,
             missing=config.missing,
-            frame=AS_IN_FILES if run is None else run.frame_for(path),
+            **({"frame": frame} if frame else {}),
         )
     except (InputError, OSError) as error:
         if given:

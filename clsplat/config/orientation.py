@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from typing import Literal
 
@@ -70,10 +70,6 @@ class FrameUse:
     def __bool__(self) -> bool:
         """True if the frame is changed."""
         return self.orient is not None or bool(self.scale)
-
-    def of_new_scene(self) -> FrameUse:
-        """Return the use for a scene that structure from motion has just made, whose own axes mean nothing."""
-        return replace(self, orient="up") if self.orient is None else self
 
     def check(self) -> None:
         """Raise InputError for an unknown value."""

@@ -23,7 +23,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
 from clsplat.scenes.readers.colmap import read_model
 from clsplat.scenes.scene import Scene
-from clsplat.scenes.sfm.framing import MODEL_FOLDER, set_frame
+from clsplat.scenes.sfm.framing import MODEL_FOLDER, scale_new, set_frame, turn_new
 from clsplat.scenes.start.point_cloud import with_points
 
 TURN = Rotation.from_euler("xyz", [40, 20, -100], degrees=True).as_matrix()
@@ -223,6 +223,18 @@ def test_two_cameras_cannot_be_turned(tmp_path: Path) -> None:
         folder,
         frame=UP,
     )
+
+
+def test_a_reconstruction_is_never_lost_to_its_frame(tmp_path: Path) -> None:
+    """Without an up direction it stays as COLMAP made it, with a warning. A wrong scale is an error that leaves it."""
+    posed = ring.poses()[:2]
+    few = ring.write_colmap(tmp_path / "few", ring.NAMES[:2], posed=posed)
+    with pytest.warns(match="expected at least 3; use --orient none to keep its axes; it is kept in COLMAP's frame"):
+        turn_new(few, few / "images", FrameUse(), few)
+    assert read_frame(few / MODEL_FOLDER) is SOURCE_FRAME
+    turn_new(few, few / "images", FrameUse("none"), few)
+    match = "no photograph x and no y.*; the cameras are recovered, give another --scale to the same command"
+    refuses(match, scale_new, few, few / "images", FrameUse("none", "x,y=2"))
 
 
 def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:

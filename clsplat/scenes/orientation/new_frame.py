@@ -21,7 +21,7 @@ from clsplat.scenes.orientation.frame_record import SceneFrame
 from clsplat.scenes.orientation.known_length import metres_per_unit
 from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.orientation.positions import MapFit, fit_map, globe_position, up_from_gps
-from clsplat.scenes.orientation.upright import Upright, up_from_gravity, upright
+from clsplat.scenes.orientation.upright import MIN_UPRIGHT_CAMERAS, Upright, up_from_gravity, upright
 from clsplat.scenes.outliers import stray_cameras
 
 
@@ -127,6 +127,8 @@ def _cameras(data: DataSet) -> dict[str, Camera]:
     images = sorted(data.images, key=lambda image: image.name)
     cameras = {image.name: image.lens.camera(image.rotation, image.translation, "undistort") for image in images}
     far = stray_cameras(list(cameras.values()))
+    if len(cameras) - far.sum() < MIN_UPRIGHT_CAMERAS:
+        return cameras
     return {name: camera for (name, camera), stray in zip(cameras.items(), far, strict=True) if not stray}
 
 

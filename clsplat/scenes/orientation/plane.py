@@ -28,8 +28,9 @@ MIN_PLANE_SHARE = 0.1
 30 times as high as the plane is thick."""
 MIN_PLANE_BREADTH = 0.15
 """Minimum ratio of a plane's two widths (standard deviations of its points). A slice of a wall is a line."""
-PLANE_REFITS = 20
-"""Number of reweighted least-squares fits of a plane."""
+PLANE_FIT_WIDTHS = (3.0,) * 10 + (1.0,) * 10
+"""Thickness of a plane in each reweighted fit, as a multiple of the last. The search has the first: on an uneven
+surface, such as a blanket, thin planes through three of its points have all angles within 4 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ def level_plane(points: Float64, up: Float64, max_tilt: float, radius: float) ->
         return None
     points = points[:: max(1, -(-len(points) // MAX_PLANE_POINTS))]
     half = PLANE_HALF_THICKNESS * radius
-    normal, height = _searched(points, up, max_tilt, half)
+    normal, height = _searched(points, up, max_tilt, PLANE_FIT_WIDTHS[0] * half)
     if normal is None:
         return None
     normal, height = _fitted(points, normal, height, half)
@@ -89,8 +90,8 @@ def _searched(points: Float64, up: Float64, max_tilt: float, half: float) -> tup
 
 def _fitted(points: Float64, normal: Float64, height: float, half: float) -> tuple[Float64, float]:
     """Fit a plane to the points near it by iteratively reweighted least squares. Returns its normal and height."""
-    for _ in range(PLANE_REFITS):
-        off = (points @ normal - height) / half
+    for width in PLANE_FIT_WIDTHS:
+        off = (points @ normal - height) / (width * half)
         weights = np.square(np.clip(1 - off * off, 0, None))  # Tukey's biweight
         if (weights > 0).sum() < 3:
             break

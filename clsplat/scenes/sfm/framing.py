@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 from clsplat.config.orientation import FrameUse
+from clsplat.errors import InputError, warn
 from clsplat.files.atomic import move_into_place
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SceneFrame, read_frame, write_frame
 from clsplat.scenes.orientation.new_frame import new_frame
@@ -15,6 +16,30 @@ from clsplat.scenes.readers.colmap import read_model
 
 MODEL_FOLDER = Path("sparse", "0")
 """Folder of the COLMAP model in a result of structure from motion."""
+
+
+def turn_new(scene: Path, photos: Path, use: FrameUse, where: object) -> None:
+    """Turn a new reconstruction upright, unless `use` wants COLMAP's axes. It keeps them if up cannot be found.
+
+    Arguments as for `set_frame`; the scale is not set here. Warns if the axes are kept: no result must be lost.
+    """
+    if use.orient == "none":
+        return
+    try:
+        set_frame(scene, photos, FrameUse("up"), where)
+    except InputError as error:
+        warn(f"{error}; it is kept in COLMAP's frame")
+
+
+def scale_new(scene: Path, photos: Path, use: FrameUse) -> None:
+    """Set the scale of a new reconstruction that is complete. Raises InputError, and then the result stays unscaled."""
+    if not use.scale:
+        return
+    axes = None if use.orient == "none" else "up"
+    try:
+        set_frame(scene, photos, FrameUse(axes, use.scale), scene)
+    except InputError as error:
+        raise InputError(f"{error}; the cameras are recovered, give another --scale to the same command") from None
 
 
 def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneFrame:

@@ -29,7 +29,7 @@ from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import photos as sfm_photos
-from clsplat.scenes.sfm.framing import set_frame
+from clsplat.scenes.sfm.framing import scale_new, set_frame, turn_new
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -155,12 +155,13 @@ def reconstruct(
         answer = _run_worker(sfm_task(settings, photos, masked, work, workers), work, report)
         if "failure" in answer:
             raise InputError(_no_model(images, len(photos), answer["failure"]))
-        set_frame(work / "result", images, settings.frame.of_new_scene(), images)
+        turn_new(work / "result", images, settings.frame, images)
         _write_record(work / "result", fingerprint, photos, answer["result"])
         _warn_of_losses(images, photos, answer["result"]["registered"], work / "result" / "images", masks)
         move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+    scale_new(output, images, settings.frame)
     return output
 
 
