@@ -14,6 +14,12 @@ from clsplat.errors import InputError
 
 MIN_CLICK_ALPHA = 0.5
 """Minimum alpha of a pixel on which a click hits the model."""
+CLICK_WINDOW_PX = 3
+"""Number of pixels on each side of a click whose depths are fitted by a plane, as a Gaussian has one depth all over."""
+SAME_SURFACE_RATIO = 0.1
+"""Largest relative difference of depths in the window that can be on the clicked surface."""
+SURFACE_FITS = 5
+"""Number of reweighted least-squares fits of the plane."""
 MAX_LENGTH_METRES = 1e6
 """Largest length that can be entered, in metres."""
 
@@ -22,7 +28,7 @@ def point_at(camera: Camera, depth: Float32, alpha: Float32, place: tuple[float,
     """Return the point (3,) of the world that a click hits.
 
     camera: a pinhole camera of the picture's size.
-    depth: (H, W), along the camera's axis in world units. alpha: (H, W).
+    depth: (H, W), along the camera's axis in world units, of the surface that is seen. alpha: (H, W).
     place: from the picture's left and top, as fractions of its width and height.
     Raises InputError for a click beside the model.
     """
@@ -33,8 +39,30 @@ def point_at(camera: Camera, depth: Float32, alpha: Float32, place: tuple[float,
     z = float(depth[row, column])
     if not (alpha[row, column] >= MIN_CLICK_ALPHA and 0 < z < np.inf):
         raise InputError("nothing is there: click on the model")
+    z = _surface_depth(depth, alpha, (x, y))
     ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0])
     return np.asarray(camera.rotation.T @ (z * ray - camera.translation))
+
+
+def _surface_depth(depth: Float32, alpha: Float32, place: tuple[float, float]) -> float:
+    """Return the depth of the surface at a place (x, y) in pixels, by a robust fit of a plane around it.
+
+    On a plane, 1 / depth is linear in x and y. Weights are Tukey's biweight.
+    """
+    column, row = (min(int(value), side - 1) for value, side in zip(place, depth.shape[::-1], strict=True))
+    rows, columns = (slice(max(at - CLICK_WINDOW_PX, 0), at + CLICK_WINDOW_PX + 1) for at in (row, column))
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]][:, rows, columns] + 0.5
+    z, centre = depth[rows, columns].astype(np.float64), float(depth[row, column])
+    near = (alpha[rows, columns] >= MIN_CLICK_ALPHA) & (np.abs(z - centre) <= SAME_SURFACE_RATIO * centre)
+    terms = np.stack([np.ones(near.sum()), x[near] - place[0], y[near] - place[1]], axis=1)
+    inverse, weights = 1 / z[near], np.ones(near.sum())
+    fit = np.array([1 / centre, 0.0, 0.0])
+    for _ in range(SURFACE_FITS):
+        roots = np.sqrt(weights)
+        fit = np.linalg.lstsq(terms * roots[:, None], inverse * roots, rcond=None)[0]
+        off = np.abs(terms @ fit - inverse)
+        weights = np.square(np.clip(1 - np.square(off / (4.7 * 1.4826 * np.median(off) + 1e-12 / centre)), 0, None))
+    return float(np.clip(1 / fit[0], *(centre * (1 + sign * SAME_SURFACE_RATIO) for sign in (-1, 1))))
 
 
 @dataclass

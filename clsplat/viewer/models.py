@@ -85,7 +85,7 @@ class HeldModel:
             return self._picture(key, camera, look, exact=exact)
 
     def depths(self, camera: Camera, look: Look) -> tuple[Float32, Float32]:
-        """Render depths along the camera's axis in world units, and alpha, each (H, W). Raises CapacityError."""
+        """Render median depths along the camera's axis (world units) and alpha, each (H, W). Raises CapacityError."""
         renderer, gaussians = self._prepared(look.changes(self.gaussians.sh_degree), exact=True)
         return _depths(renderer, gaussians, camera)
 
@@ -161,7 +161,7 @@ Model = HeldModel | LiveModel
 
 def _depths(renderer: Renderer, model: Gaussians | AnyGaussians, camera: Camera) -> tuple[Float32, Float32]:
     frame, channels = renderer.render_channels(model, camera, contiguous=False)
-    return channels["depth"], frame.alpha
+    return channels["median"], frame.alpha
 
 
 def render_picture(
