@@ -73,7 +73,7 @@ def _degrees(spec: Any, name: str, negative: str, most: float) -> float | None:
     parts = value if isinstance(value, tuple) else (value,)
     if not 1 <= len(parts) <= 3 or not all(isinstance(part, int | float) and isfinite(part) for part in parts):
         return None
-    degrees = sum(float(part) / 60**place for place, part in enumerate(parts))
+    degrees: float = sum(float(part) / 60**place for place, part in enumerate(parts))
     if not abs(degrees) <= most:
         return None
     reference = str(spec.get_string_attribute(f"GPS:{name}Ref"))

@@ -411,8 +411,7 @@ def owned_files(path: Path) -> list[Path]:
 def check_resumed(earlier: Run, config: TrainConfig) -> None:
     """Raise InputError if `config` changes a setting that a resumed run has to keep."""
     of_model = ("sh_degree", "seed", "test_every", "test_most", "lenses", "appearance", "antialiased", "perspective")
-    of_model = (*of_model, "orient", "scale")
-    for name in (*of_model, "refine_poses", "refine_lenses"):
+    for name in (*of_model, "orient", "scale", "refine_poses", "refine_lenses"):
         was, now = getattr(earlier.config, name), getattr(config, name)
         if was != now:
             raise InputError(f"{earlier.config_path}: {name} is {was}, a resumed run cannot change it to {now}")

@@ -79,8 +79,8 @@ def load_scene(
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
-    frame: how the frame of the files is changed (`clsplat.scenes.orientation`), or the frame of an earlier run, which
-        the scene gets.
+    frame: how the frame of the files is changed, such as `clsplat.config.orientation.FrameUse("up")`, or the frame of
+        an earlier run, which the scene gets.
 
     A folder of photographs goes through `clsplat.scenes.sfm.reconstruct` first. An earlier result for the same
     photographs is reused.

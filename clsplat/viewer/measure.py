@@ -62,7 +62,8 @@ def _surface_depth(depth: Float32, alpha: Float32, place: tuple[float, float]) -
         fit = np.linalg.lstsq(terms * roots[:, None], inverse * roots, rcond=None)[0]
         off = np.abs(terms @ fit - inverse)
         weights = np.square(np.clip(1 - np.square(off / (4.7 * 1.4826 * np.median(off) + 1e-12 / centre)), 0, None))
-    return float(np.clip(1 / fit[0], *(centre * (1 + sign * SAME_SURFACE_RATIO) for sign in (-1, 1))))
+    least, most = centre * (1 - SAME_SURFACE_RATIO), centre * (1 + SAME_SURFACE_RATIO)
+    return float(np.clip(1 / fit[0], least, most))
 
 
 @dataclass

@@ -7,6 +7,7 @@ scale and north come from a fit on the map, for a known up direction. Up comes f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -56,7 +57,7 @@ class MapFit:
     @property
     def error(self) -> float:
         """Relative standard error of `metres`, if the positions have independent errors."""
-        return self.residual / (self.spread * len(self.names) ** 0.5)
+        return self.residual / (self.spread * math.sqrt(len(self.names)))
 
     @property
     def note(self) -> str:

@@ -7,7 +7,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from clsplat.config.orientation import FrameUse
+from clsplat.config.orientation import FrameUse, Orient
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import move_into_place
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SceneFrame, read_frame, write_frame
@@ -35,7 +35,7 @@ def scale_new(scene: Path, photos: Path, use: FrameUse) -> None:
     """Set the scale of a new reconstruction that is complete. Raises InputError, and then the result stays unscaled."""
     if not use.scale:
         return
-    axes = None if use.orient == "none" else "up"
+    axes: Orient | None = None if use.orient == "none" else "up"
     try:
         set_frame(scene, photos, FrameUse(axes, use.scale), scene)
     except InputError as error:
