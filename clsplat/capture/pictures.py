@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
@@ -31,12 +32,15 @@ class ModelPictures:
 
     cameras: cameras of the photographs.
     frames: number of frames of the turntable.
+    up: up direction (3,) of an upright scene; None to estimate it from the cameras.
     """
 
-    def __init__(self, run: Run, device: Device, cameras: Sequence[Camera], frames: int) -> None:
+    def __init__(
+        self, run: Run, device: Device, cameras: Sequence[Camera], frames: int, up: Float64 | None = None
+    ) -> None:
         self._renderer = Renderer(device, config=run.config.rasterizer)
         self._model = Gaussians.load(run.model_path)
-        self.path = turntable(cameras, frames)
+        self.path = turntable(cameras, frames, up)
 
     def _drawn(self, camera: Camera) -> NDArray[np.uint8]:
         """Render a picture (H, W, 3) over black."""

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from clsplat.capture.folder import CaptureFolder
 from clsplat.capture.pictures import ModelPictures
 from clsplat.capture.progress import CaptureProgress
@@ -29,6 +31,7 @@ from clsplat.report.page import write_report
 from clsplat.runs.run import Run
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.sfm.reconstruct import DEFAULT_SFM_SETTINGS, SFM_RECORD_FILE, SfmSettings, reconstruct
 
 ASSUMED_PHOTOGRAPHS = 100
@@ -129,8 +132,9 @@ def _show(folder: CaptureFolder, run: Run, plan: CapturePlan, device: Device, pr
         _write_report(folder, run, progress)
     with progress.stage("thumbnail"):
         folder.begin("thumbnail", source)
-        cameras = [view.camera for view in load_scene(folder.scene, resolution=run.config.resolution).views]
-        pictures = ModelPictures(run, device, cameras, plan.turntable_frames)
+        scene = load_scene(folder.scene, resolution=run.config.resolution)
+        up = np.array(COLMAP_UP) if scene.frame.upright else None
+        pictures = ModelPictures(run, device, [view.camera for view in scene.views], plan.turntable_frames, up)
         if not folder.thumbnail.is_file():
             progress("rendering the thumbnail")
             pictures.write_thumbnail(folder.thumbnail)

@@ -18,6 +18,7 @@ from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import Rule, check_rules
 from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.masks import NO_MASKS
+from clsplat.config.orientation import AS_IN_FILES
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import check_new
 from clsplat.files.documents import is_file, read_document
@@ -87,8 +88,8 @@ class ConversionReport(TypedDict):
 class ConvertVerb(Verb):
     """Convert a model to the format of the output file's ending, with optional edits, and report rounding errors.
 
-    Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. Only --scene and
-    --prune-contribution need a device. docs/formats.md describes the formats.
+    Edits are made in this order: merge, crop, prune, frame, transform, rotate, scale, translate, drop-sh. Only --scene
+    and --prune-contribution need a device. docs/formats.md describes the formats.
     """
 
     source: RunOrModel
@@ -114,6 +115,9 @@ class ConvertVerb(Verb):
     contribution is alpha times transmittance, summed over the picture, like --density.min-contribution in training."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Cameras for --prune-contribution, in any format that `clsplat render` reads."""
+    frame: Annotated[Literal["source"] | None, arg(metavar="source")] = None
+    """source: bring the model of a run back to the frame that the scene's cameras had before --orient and --scale of
+    clsplat sfm and train, such as COLMAP's own."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
     """Transform the model by a 4 x 4 matrix: rotation, uniform scale, translation, and a mirror if wanted. Give 16
     numbers row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
@@ -308,6 +312,21 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
         )
 
 
+def _to_source_frame(source: Path) -> Float64:
+    """Return the similarity (4, 4) from the frame of a run's model to the one that its cameras had first."""
+    import numpy as np
+
+    from clsplat.runs.run import run_of
+
+    run = run_of(source)
+    if run is None:
+        raise InputError(
+            f"--frame source: {source} is not in a run, which has the transform in frame.json; expected a run"
+        )
+    frame = run.frame
+    return np.eye(4) if frame is None else np.asarray(np.linalg.inv(frame.world_from_source), np.float64)
+
+
 def _similarity(verb: ConvertVerb) -> Float64 | None:
     """Return the matrix (4, 4) of --transform, --rotate, --scale and --translate, in this order; None without them.
 
@@ -318,6 +337,8 @@ def _similarity(verb: ConvertVerb) -> Float64 | None:
     from clsplat.models import edit
 
     steps: list[Float64] = []
+    if verb.frame is not None:
+        steps.append(_to_source_frame(verb.source))
     if (text := verb.transform) is not None:
         words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX_FILE_BYTES) if is_file(text) else text
         steps.append(np.array(_numbers("transform", words, 16)).reshape(4, 4))
@@ -408,7 +429,9 @@ def _measured(
     run = run_of(verb.source)
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
-    scene = load_scene(services, verb.scene, verb.resolution, (verb.test_every, TEST_MOST), masks, missing="skip")
+    frame = AS_IN_FILES if run is None else run.frame_for(verb.scene)
+    split = (verb.test_every, TEST_MOST)
+    scene = load_scene(services, verb.scene, verb.resolution, split, masks, missing="skip", frame=frame)
     renderer = services.renderer(services.require(device, FORWARD_STAGES))
     background = background_colour(verb.background)
 

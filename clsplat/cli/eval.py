@@ -13,6 +13,7 @@ from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
+from clsplat.config.orientation import AS_IN_FILES
 from clsplat.config.training import Missing, TrainConfig
 from clsplat.errors import CapacityError, InputError, warn
 
@@ -141,7 +142,9 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     test_every = config.test_every if verb.test_every is None else verb.test_every
     test_most = config.test_most if verb.test_most is None else verb.test_most
     missing = verb.missing or config.missing
-    scene = load_scene(services, source, resolution, (test_every, test_most), config.mask_use, config.lenses, missing)
+    frame = AS_IN_FILES if trained is None else trained.frame_for(source)
+    split = (test_every, test_most)
+    scene = load_scene(services, source, resolution, split, config.mask_use, config.lenses, missing, frame)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}, expected at least one")

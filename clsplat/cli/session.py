@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
     from clsplat.scenes.analysis.photo_findings import Finding
+    from clsplat.scenes.orientation.frame_record import SceneFrame
     from clsplat.scenes.scene import Scene
 
 
@@ -64,6 +66,7 @@ def load_scene(
     masks: MaskUse = NO_MASKS,
     lenses: Lenses = "undistort",
     missing: Missing = "few",
+    frame: FrameUse | SceneFrame = AS_IN_FILES,
 ) -> Scene:
     """Load the scene in the folder `path`, print its warnings, and return it.
 
@@ -79,6 +82,7 @@ def load_scene(
         lenses=lenses,
         missing=missing,
         progress=StageProgress(),
+        **({"frame": frame} if frame else {}),
     )
     for text in scene.warnings:
         warn(text)

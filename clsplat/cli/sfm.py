@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import Flag, OptionalInt, Output, Verb
 from clsplat.cli.session import Services
 from clsplat.config.masks import MaskMeaning, MaskUse
+from clsplat.config.orientation import FrameUse
 from clsplat.errors import InputError
 from clsplat.progress import StageProgress
 
@@ -46,6 +48,14 @@ class SfmVerb(Verb):
     """Number of CPU threads. If not given: one per core."""
     seed: int = 0
     """Random seed of matching and reconstruction. The same seed gives the same cameras, for up to 80 photos."""
+    orient: Annotated[Literal["up", "none"] | None, arg(metavar="up|none")] = None
+    """up: turn the scene upright, with up along -y, the ground at zero and the middle in the middle. none: COLMAP's own
+    axes, which are arbitrary. If not given: up, but an existing scene keeps its frame. Cameras are not recovered anew.
+    sparse/0/frame.json has the transform."""
+    scale: str = ""
+    """Length that makes the scene's units metres: A.JPG,B.JPG=METRES, the distance between the cameras of two photos;
+    X,Y,Z,X,Y,Z=METRES, between two points of the scene (the viewer measures them); or gps, the positions in the photos'
+    EXIF, with z to the north if the scene is turned up too. If not given: no unit is known."""
     masks: Flag = False
     """Detect no features in the black areas of the photos' masks (masks/IMAGE.jpg.png and the like). The undistorted
     masks are written to the scene."""
@@ -56,7 +66,7 @@ class SfmVerb(Verb):
     overwrite: Flag = False
     """Replace an existing scene in the output folder that was made from other photos or with other settings."""
     json: Flag = False
-    """Print the result as JSON, as in the scene's sfm.json."""
+    """Print the result as JSON: the scene's sfm.json, and its frame.json as `frame`."""
 
 
 def run(verb: SfmVerb, services: Services) -> int:
@@ -69,8 +79,21 @@ def run(verb: SfmVerb, services: Services) -> int:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
     if verb.invert_masks and not verb.masks:
         raise InputError("--invert-masks: no masks are used without --masks, expected both flags")
+    from clsplat.scenes.orientation.frame_record import read_frame
+    from clsplat.scenes.sfm.framing import MODEL_FOLDER
     from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
 
+    frame = FrameUse(verb.orient, verb.scale)
+    settings = SfmSettings(
+        matching=verb.matching,
+        camera_model=verb.camera_model,
+        seed=verb.seed,
+        mapper=verb.mapper,
+        features=verb.features,
+        weights=verb.weights,
+        frame=frame,
+    )
+    settings.check()
     masks = None
     if verb.masks or verb.alpha:
         of_masks: MaskMeaning = "ignore" if verb.masks else "none"
@@ -78,21 +101,18 @@ def run(verb: SfmVerb, services: Services) -> int:
     services.reconstruct(
         verb.photos,
         verb.output,
-        SfmSettings(
-            matching=verb.matching,
-            camera_model=verb.camera_model,
-            seed=verb.seed,
-            mapper=verb.mapper,
-            features=verb.features,
-            weights=verb.weights,
-        ),
+        settings,
         threads=verb.threads,
         overwrite=verb.overwrite,
         masks=masks,
         frames=verb.frames,
         progress=StageProgress(),
     )
+    known = read_frame(verb.output / MODEL_FOLDER)
+    for note in known.notes:
+        print(note, file=sys.stderr)
     if verb.json:
-        print((verb.output / SFM_RECORD_FILE).read_text("utf-8").rstrip())
+        record = json.loads((verb.output / SFM_RECORD_FILE).read_text("utf-8"))
+        print(json.dumps({**record, "frame": known.document()}, indent=2))
     print(f"scene in {verb.output}; next: clsplat train {verb.output} -o RUN", file=sys.stderr)
     return 0

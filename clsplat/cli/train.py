@@ -229,6 +229,8 @@ def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> No
         f"{len(scene.points):,} points{unit}; on {on} (the first steps may take longer, while kernels are built)",
         file=sys.stderr,
     )
+    for note in scene.frame.notes:
+        print(f"{scene.name}: {note}", file=sys.stderr)
     if scene.test_views:
         tell_of_lpips()
 
@@ -318,7 +320,14 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
         with open_input(Path(config.points), "a cloud of points"):
             pass
     scene = load_scene(
-        services, source, config.resolution, config.test_views, config.mask_use, config.lenses, config.missing
+        services,
+        source,
+        config.resolution,
+        config.test_views,
+        config.mask_use,
+        config.lenses,
+        config.missing,
+        (earlier.frame if earlier is not None else None) or config.frame_use,
     )
     scene = prepared(scene, config, earlier)
     _check_scene(scene)

@@ -16,11 +16,13 @@ from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, PageOptions, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services
+from clsplat.config.orientation import AS_IN_FILES
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, endings, handled
 
 if TYPE_CHECKING:
+    from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
     from clsplat.viewer.server import Server
     from clsplat.viewer.training_view import TrainingView
@@ -78,14 +80,15 @@ def run(verb: ViewVerb, services: Services) -> int:
     if not len(gaussians):
         raise InputError(f"{file}: has no Gaussians, expected at least one")
     config = run.config if run else TrainConfig()
-    scene = _scene(services, verb.scene or (run.scene if run else None), config, given=verb.scene is not None)
+    scene = _scene(services, verb.scene or (run.scene if run else None), run, given=verb.scene is not None)
     device = verb.device.trusted(services, FORWARD_STAGES)
     background = background_colour(verb.background or config.background)
     model = HeldModel(gaussians, device, config.rasterizer, background, colour_space(file))
     views = scene.views if scene else []
     low, high = extent_of(gaussians.means)
     box = (low + gaussians.origin, high + gaussians.origin)
-    start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
+    level = scene is not None and scene.frame.upright
+    start = start_of([view.camera for view in views], gaussians.means + gaussians.origin, level=level)
     world = World(file.name, start, gaussians.origin, box, gaussians.sh_degree, views)
     for exact in (False, True):  # render two pictures now, to build the kernels
         model.picture(looking(start, WARM_UP_PICTURE_SIZE_PX).camera(), Look(), exact=exact)
@@ -120,7 +123,7 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
     @contextmanager
     def page(scene: Scene, config: TrainConfig) -> Iterator[TrainingView]:
         box = extent_of(scene.points) if len(scene.points) else scene.bounds
-        start = start_of([view.camera for view in scene.views], scene.points)
+        start = start_of([view.camera for view in scene.views], scene.points, level=scene.frame.upright)
         world = World(scene.name, start, scene.origin, box, config.sh_degree, scene.views)
         viewing = Viewing()
         with closing(Server(viewing, world, address, training=True)) as server:
@@ -130,14 +133,16 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
     return page
 
 
-def _scene(services: Services, path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
+def _scene(services: Services, path: Path | None, run: Run | None, *, given: bool) -> Scene | None:
     """Load the scene for its cameras and photos, or return None if there is no scene to show.
 
-    path: the scene's folder, or None.
+    run: the model's run, whose settings and frame the scene gets.
     given: True if --scene names the scene. Then an unreadable scene is an error; otherwise it causes a warning.
     """
     if path is None:
         return None
+    config = run.config if run else TrainConfig()
+    frame = AS_IN_FILES if run is None else run.frame_for(path)
     try:
         return services.load_scene(
             path,
@@ -147,6 +152,7 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
             masks=config.mask_use,
             lenses=config.lenses,
             missing=config.missing,
+            **({"frame": frame} if frame else {}),
         )
     except (InputError, OSError) as error:
         if given:

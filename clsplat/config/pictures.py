@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of rendered pictures (docs/pictures.md): colour space, overscan and region, supersampling, distortion,
-shutter, lens, deep EXR, video and file encoding.
+shutter, lens, deep EXR, holdouts, video and file encoding.
 
 The flags of `clsplat render` are built from these dataclasses, so this module imports nothing slow.
 """
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from clsplat.cameras.model import CameraModel
 
 Filter = Literal["box", "blackman-harris"]
+Depths = Literal["z", "inverse", "ray"]
 
 STRIP_PIXELS = 1 << 24
 """Maximum number of pixels in a strip of a picture, before --supersample's filter. With every channel, a strip takes
@@ -30,6 +31,9 @@ DEEP_MERGE_FLOATS = 1 << 26
 """Maximum number of floats in memory at once while deep pictures are merged. They take 256 MiB."""
 SENSOR_WIDTH_MM = 36.0
 """Default width of the picture on the sensor, in millimetres."""
+HOLDOUT_SURFACE_FIELDS = ("Z", "BACK", "KEEP", "RATE")
+"""Fields of a holdout surface. Z and BACK: depths of its front and back. KEEP: its transmittance. RATE: log2 of the
+transmittance per unit of depth; 0 for a surface without thickness."""
 _MAX_SUPERSAMPLES = 64
 _MAX_SAMPLES_PER_FRAME = 4096
 _MAX_DEEP_BINS = 256
@@ -343,3 +347,14 @@ class Encoding:
     bits: int = 8
     quality: int = 95
     prores: ProRes = "hq"
+
+
+@dataclass(frozen=True)
+class HoldoutConfig:
+    """Settings for reading the files of --holdout."""
+
+    channel: str = ""
+    """Depth channel in --holdout's files, such as depth.Z; Z if not given. Alpha is the channel A of the same layer."""
+    depths: Depths = "z"
+    """Kind of the depths. z: along the camera's axis. inverse: 1 / z, as Nuke writes it. ray: distances from the
+    camera."""

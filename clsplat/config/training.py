@@ -15,6 +15,7 @@ from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
 from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.depth import DepthSource, DepthUse, MapKind
 from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
+from clsplat.config.orientation import FrameUse, Orient, parse_scale
 from clsplat.config.points import DEFAULT_MAX_FILE_POINTS, PointsUse, StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError
@@ -274,6 +275,14 @@ class TrainConfig:
     """Handling of pictures that the scene lists but that are missing. few: up to a tenth of them are left out, with a
     warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
     the same."""
+    orient: Orient = "none"
+    """up: turn the scene upright, with the ground at zero and the middle in the middle. Up is -y, by gravity or GPS in
+    the photographs' metadata, a level plane of points, and the cameras. none: keep the frame of the scene's files;
+    photos alone are turned by clsplat sfm. frame.json in the run has the transform."""
+    scale: str = ""
+    """Length that makes world units metres: A.JPG,B.JPG=METRES, the distance between the cameras of two photographs;
+    X,Y,Z,X,Y,Z=METRES, between two points in the scene's frame; or gps, the positions in the photographs' EXIF. With
+    --orient up and gps, z points north. Depth maps are scaled too. If empty: the scale of the scene's files."""
     lenses: Lenses = "undistort"
     """Handling of fisheye photographs. undistort: convert to the pinhole pictures that they contain. native: train with
     the fisheye lens, which shows the whole photograph, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) are always
@@ -379,6 +388,7 @@ class TrainConfig:
         check_rules(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
             check_steps(f"--{name}", steps)
+        parse_scale(self.scale)
         self._check_together()
         self.optimiser.check()
         self.density.check()
@@ -438,6 +448,11 @@ class TrainConfig:
     def mask_use(self) -> MaskUse:
         """Meaning of the scene's masks and alpha channels."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
+
+    @property
+    def frame_use(self) -> FrameUse:
+        """How the frame of the scene's files is changed."""
+        return FrameUse("up" if self.orient == "up" else None, self.scale)
 
     def rounds_photos(self, photographs: int) -> bool:
         """True if --photos rounds pixels to 8 bits per channel. photographs: number of training photographs."""

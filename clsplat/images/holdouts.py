@@ -15,7 +15,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
+from clsplat.config.pictures import HOLDOUT_SURFACE_FIELDS
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import is_file
 from clsplat.images.reading import error_of, one_line, open_image

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
+from clsplat.config.pictures import HOLDOUT_SURFACE_FIELDS
 from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
 
 TILE = 16  # tile_size in gsplat

@@ -181,6 +181,11 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_
     )
 
 
+def moved(points: Float64, matrix: Float64) -> Float64:
+    """Transform points (N, 3) by a similarity (4, 4)."""
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
+
+
 def scaling(factor: float) -> Float64:
     """Matrix (4, 4) that scales the world about its origin."""
     return np.diag([factor, factor, factor, 1.0])

@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.store import ChunkStore
+from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.files.atomic import TEMPORARY_SUFFIX, atomic_write, atomic_writer, remove, write_error
@@ -38,6 +40,8 @@ from clsplat.runs.settings import (
     config_text,
     read_config,
 )
+from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
+from clsplat.scenes.readers.colmap import frame_of_files
 
 KEPT_CHECKPOINTS = 2
 """Number of latest checkpoints that a run keeps."""
@@ -122,6 +126,42 @@ class Run:
             raise InputError(f"{path}: is not a run (no config.toml of clsplat in it)")
         config, scene = read_config(path / "config.toml")
         return cls(path, config, scene)
+
+    @property
+    def frame(self) -> SceneFrame | None:
+        """Frame of the run's scene and model, from frame.json; None without this file. Raises InputError."""
+        return read_frame(self.path) if (self.path / FRAME_RECORD_FILE).exists() else None
+
+    def keep_frame(self, frame: SceneFrame) -> None:
+        """Write frame.json, unless the frame is the one that the scene's cameras had first."""
+        if not frame.is_source:
+            write_frame(self.path, frame)
+
+    def is_scene(self, path: Path) -> bool:
+        """True if `path` is the run's scene, or what structure from motion made of it."""
+        if self.scene is None:
+            return False
+        own, other = self.scene.resolve(), path.resolve()
+        return other in (own, own.with_name(f"{own.name}_colmap"))
+
+    def frame_for(self, path: Path) -> FrameUse | SceneFrame:
+        """Return the frame in which the scene `path` fits the model: of the run's own scene, the model's frame.
+
+        Other scenes keep the frame of their files. Raises InputError for a damaged frame.json.
+        """
+        if not self.is_scene(path):
+            return AS_IN_FILES
+        return self.frame or self.config.frame_use
+
+    def change_of(self, cameras: Path) -> Float64 | None:
+        """Return the similarity (4, 4) from the frame of a scene's files to the model's.
+
+        cameras: the scene's folder or file. None if it is not the run's scene, or if the frames are equal. Raises
+          InputError.
+        """
+        if (frame := self.frame) is None or not self.is_scene(cameras):
+            return None
+        return frame.change_from(frame_of_files(cameras) if cameras.is_dir() else SOURCE_FRAME)
 
     def keep_config(self, config: TrainConfig) -> None:
         """Write config.toml if the settings in `config` differ from the settings in the file."""
@@ -367,7 +407,8 @@ def owned_files(path: Path) -> list[Path]:
     )
     # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.
     learnt = ("appearance.json", "appearance.npz")
-    names = ("model.ply", "metrics.jsonl", "eval.json", *learnt, "report.html", "scene.json", "config.toml")
+    records = ("eval.json", *learnt, "report.html", FRAME_RECORD_FILE, "scene.json")
+    names = ("model.ply", "metrics.jsonl", *records, "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in files if file.is_file() or file.is_symlink()]
 
@@ -375,7 +416,7 @@ def owned_files(path: Path) -> list[Path]:
 def check_resumed(earlier: Run, config: TrainConfig) -> None:
     """Raise InputError if `config` changes a setting that a resumed run has to keep."""
     of_model = ("sh_degree", "seed", "test_every", "test_most", "lenses", "appearance", "antialiased", "perspective")
-    for name in (*of_model, "refine_poses", "refine_lenses"):
+    for name in (*of_model, "orient", "scale", "refine_poses", "refine_lenses"):
         was, now = getattr(earlier.config, name), getattr(config, name)
         if was != now:
             raise InputError(f"{earlier.config_path}: {name} is {was}, a resumed run cannot change it to {now}")

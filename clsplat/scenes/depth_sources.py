@@ -16,6 +16,7 @@ from clsplat.config.depth import DepthUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file
 from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
+from clsplat.models.edit import decompose, moved
 from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of, tracked_in_view
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
@@ -124,10 +125,11 @@ def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
         )
     nothing = (np.empty((0, 3)), np.empty(0))
     lenses, known = {view.name: view.lens for view in scene.views}, {}
+    scale = 1.0 if scene.world_from_files is None else decompose(scene.world_from_files)[0]
     for name, path in files.items():
         width, height, whole = map_header(path)
         _check_shape(path, width, height, lenses[name])
-        known[name] = KnownDepth(*nothing, path, use.unit if whole else 1.0, whole=whole)
+        known[name] = KnownDepth(*nothing, path, scale * (use.unit if whole else 1.0), whole=whole)
     if use.maps == "relative":
         return _fitted(scene, known)
     return {name: one for name, one in known.items() if one.measured(read_map(_path(one))).any()}
@@ -220,7 +222,12 @@ def _maps_in(folder: Path) -> Iterator[Path]:
 def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
     """Return the folder of the COLMAP model that the scene was read from, and its tracks; None for other scenes."""
     model = None if scene.source is None else colmap.find_model(scene.source)
-    return None if model is None else (model, colmap.read_tracks(model))
+    if model is None:
+        return None
+    tracks = colmap.read_tracks(model)
+    if scene.world_from_files is not None:
+        tracks = replace(tracks, points=moved(tracks.points, scene.world_from_files))
+    return model, tracks
 
 
 def length_unit_of(scene: Scene) -> float:

@@ -18,15 +18,20 @@ from clsplat.camera import Camera
 from clsplat.config.checks import misfit
 from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.config.training import Lenses, Missing
 from clsplat.errors import InputError, examples, plain, warn
 from clsplat.files.documents import digest
 from clsplat.images.reading import image_size
+from clsplat.models.edit import decompose
 from clsplat.progress import Progress
 from clsplat.scenes.camera_checks import camera_checks
 from clsplat.scenes.dataset import DataSet, Lens, PosedImage
 from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transforms
+from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
+from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
+from clsplat.scenes.readers.colmap import frame_of_files
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
@@ -58,6 +63,7 @@ def load_scene(
     progress: Progress | None = None,
     masks: MaskUse = NO_MASKS,
     missing: Missing = "few",
+    frame: FrameUse | SceneFrame = AS_IN_FILES,
 ) -> Scene:
     """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
@@ -74,6 +80,8 @@ def load_scene(
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
+    frame: how the frame of the files is changed, such as `clsplat.config.orientation.FrameUse("up")`, or the frame of
+        an earlier run, which the scene gets.
 
     A folder of photographs or videos, and a video, goes through `clsplat.scenes.sfm.reconstruct` first. An earlier
     result for the same photographs is reused.
@@ -98,6 +106,7 @@ def load_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         files = _read(path, kind, images, missing, masks, work_dir, progress)
+        files = _reframed(files, path, frame)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
         # Outlier cameras are not checked, because `_scene` has already warned of them.
@@ -115,12 +124,16 @@ class _SceneFiles:
     source: the folder from which the data set was read. For photographs it is the result of structure from motion.
     smaller: folders of downscaled pictures that may be used instead of the data set's pictures.
     masks: the meaning of masks and alpha channels in `source`.
+    frame: the frame of `data`.
+    world_from_files: (4, 4), the similarity from the frame of the files to that of `data`; None if they are equal.
     """
 
     data: DataSet
     source: Path
     smaller: Sequence[Path]
     masks: MaskUse
+    frame: SceneFrame = SOURCE_FRAME
+    world_from_files: Float64 | None = None
 
 
 def _read(
@@ -145,7 +158,21 @@ def _read(
         folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)
-    return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)
+    return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks, frame_of_files(folder))
+
+
+def _reframed(files: _SceneFiles, path: Path, frame: FrameUse | SceneFrame) -> _SceneFiles:
+    """Return the data set in another frame. frame: as for `load_scene`."""
+    if isinstance(frame, FrameUse):
+        frame.check()
+        if not frame:
+            return files
+        photographs = {image.name: image.path for image in files.data.images}
+        frame = new_frame(path, files.data, photographs, frame, files.frame, turned=False)
+    change = frame.change_from(files.frame)
+    if change is None:
+        return replace(files, frame=frame)
+    return replace(files, data=in_frame(files.data, change), frame=frame, world_from_files=change)
 
 
 def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[int, int], lenses: Lenses) -> list[View]:
@@ -190,6 +217,10 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     name = path.resolve().name if path.is_dir() else path.resolve().parent.name
     scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
     scene.missing = tuple(data.missing)
+    scene.frame, scene.world_from_files = files.frame, files.world_from_files
+    if files.world_from_files is not None:
+        scale, _, shift = decompose(files.world_from_files)
+        scene.bounds = shift - scale * cube, shift + scale * cube
     if len(scene.points) == 0:
         scene = with_cloud_beside(scene)
         if not len(scene.points) and kind in ("colmap", "photos"):

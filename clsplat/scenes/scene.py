@@ -23,6 +23,7 @@ from clsplat.errors import InputError, reason_of
 from clsplat.files.documents import short_digest
 from clsplat.images.reading import downscale, read_image
 from clsplat.scenes.dataset import Lens, pixels_of, undistort
+from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.scenes.supervision.masks import MASK_THRESHOLD, Mask
@@ -194,6 +195,8 @@ class Scene:
     clouds: point files next to the scene that are not used.
     missing: names of listed pictures that do not exist.
     unit: the length unit in world units (`scenes.depth_sources`); None for the extent.
+    frame: the frame of the scene, relative to the frame that its cameras had first.
+    world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
     """
 
     name: str
@@ -209,6 +212,8 @@ class Scene:
     clouds: tuple[Path, ...] = ()
     missing: tuple[str, ...] = ()
     unit: float | None = None
+    frame: SceneFrame = SOURCE_FRAME
+    world_from_files: Float64 | None = None
 
     @cached_property
     def train_views(self) -> list[View]:

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from clsplat.camera import Camera
-from clsplat.config.holdout import HoldoutConfig
-from clsplat.config.pictures import SamplingConfig
+from clsplat.config.pictures import HoldoutConfig, SamplingConfig
 from clsplat.errors import InputError, examples, warn
 from clsplat.images.frame_files import VIDEO_SUFFIXES
 from clsplat.images.holdouts import check_holdout

@@ -15,11 +15,11 @@ import numpy as np
 
 from clsplat.camera import DEFAULT_NEAR_PLANE, JACOBIAN_CLAMP_HALF_FRAMES, Camera
 from clsplat.config.channels import WRITABLE_CHANNELS
-from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import (
     DeepConfig,
     Encoding,
     FramingConfig,
+    HoldoutConfig,
     PictureConfig,
     SamplingConfig,
     parse_overscan,

@@ -2,7 +2,7 @@
 """Default cameras for a model without camera files: rings around the model, from its Gaussians' positions and sizes.
 
 If a run has recorded its photographs' cameras, a path can go among these cameras instead.
-`shots/viewpoints.py` has the default up axis.
+The up axis: `scenes/orientation/level.py`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.outliers import stray_cameras
-from clsplat.shots.viewpoints import COLMAP_UP, extent_of, look_at
+from clsplat.shots.viewpoints import extent_of, look_at
 
 DEFAULT_ORBIT_SIZE_PX = (1280, 720)
 """Default width and height of pictures, in pixels."""

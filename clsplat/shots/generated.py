@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
+from clsplat.scenes.orientation.level import focus_point, up_axis
 from clsplat.shots.keyframes import Key, interpolate
-from clsplat.shots.viewpoints import MAX_AZIMUTH_GAP_RADIANS, covered_arc, focus_point, look_at, up_axis
+from clsplat.shots.viewpoints import MAX_AZIMUTH_GAP_RADIANS, covered_arc, look_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,8 @@ def _check(name: str, cameras: Sequence[Camera], frames: int) -> None:
         raise ValueError(f"{name}: {frames} frames from {len(cameras)} cameras, expected at least one of each")
 
 
-def _ring(cameras: Sequence[Camera]) -> _Ring:
-    up, focus = up_axis(cameras), focus_point(cameras)
+def _ring(cameras: Sequence[Camera], known_up: Float64 | None) -> _Ring:
+    up, focus = up_axis(cameras) if known_up is None else known_up, focus_point(cameras)
     offsets = np.stack([camera.position for camera in cameras]) - focus
     heights = offsets @ up
     level = offsets - heights[:, None] * up
@@ -70,16 +71,18 @@ def _ring(cameras: Sequence[Camera]) -> _Ring:
     return _Ring(cameras[0], up, east, north, focus, offsets, heights, np.linalg.norm(level, axis=1), azimuths)
 
 
-def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+def turntable(cameras: Sequence[Camera], frames: int, up: Float64 | None = None) -> list[Camera]:
     """A closed path of `frames` cameras around the point that the scene's cameras look at, their focus point.
 
     The path keeps the cameras' median distance and height, and begins near the first camera. If the cameras surround
     the focus point, the path makes one full turn. If they leave a wide gap, the path swings back and forth over the arc
-    that the cameras cover, since no camera has seen the rest. Intrinsics are the first camera's. Raises ValueError for
-    no cameras or no frames.
+    that the cameras cover, since no camera has seen the rest. Intrinsics are the first camera's.
+
+    up: up direction (3,); None to estimate it from the cameras.
+    Raises ValueError for no cameras or no frames.
     """
     _check("turntable", cameras, frames)
-    ring = _ring(cameras)
+    ring = _ring(cameras, up)
     radius, height = float(np.median(ring.radii)), float(np.median(ring.heights))
 
     time = np.arange(frames) / frames
@@ -105,7 +108,7 @@ SMOOTHING_NEIGHBOURS = 3
 of hand-held photographs."""
 
 
-def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+def spiral(cameras: Sequence[Camera], frames: int, up: Float64 | None = None) -> list[Camera]:
     """A closed path of two turns that rises and sinks over the cameras' range of heights, facing their focus point.
 
     Coordinates are spherical about `focus_point`. If the cameras stand all around this point, the path makes two full
@@ -116,10 +119,13 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     azimuth goes once to and fro over the arc that the cameras cover, and the elevation between the two percentiles. The
     distance goes to and fro once in the whole path, between the 10th and 90th percentile of the cameras' distances.
 
-    Intrinsics are the first camera's. Raises ValueError for no cameras or no frames.
+    Intrinsics are the first camera's.
+
+    up: as for `turntable`.
+    Raises ValueError for no cameras or no frames.
     """
     _check("spiral", cameras, frames)
-    ring = _ring(cameras)
+    ring = _ring(cameras, up)
     elevations = np.clip(
         np.arctan2(ring.heights, ring.radii), -MAX_SPIRAL_ELEVATION_RADIANS, MAX_SPIRAL_ELEVATION_RADIANS
     )
@@ -147,7 +153,7 @@ def _between(values: Float64, wave: Float64) -> Float64:
     return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * wave)
 
 
-def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+def through(cameras: Sequence[Camera], frames: int, up: Float64 | None = None) -> list[Camera]:  # noqa: ARG001
     """A smoothed path from the first camera to the last, in their order, at constant speed, with the first camera's
     intrinsics.
 

@@ -11,6 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples
@@ -19,6 +22,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.formats.usd import USD_SUFFIXES
 from clsplat.scenes.camera_checks import cameras_of
 from clsplat.scenes.dataset import PosedImage
+from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO, stray_cameras
 from clsplat.scenes.readers import colmap, transforms
 from clsplat.scenes.readers.colmap import find_model, read_cameras
@@ -31,7 +35,6 @@ from clsplat.shots.readers.nerfstudio import read_camera_path
 from clsplat.shots.readers.usd import read_usd
 from clsplat.shots.readers.usd_settings import window_named
 from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot, named, numbered, photographs
-from clsplat.shots.viewpoints import COLMAP_UP
 
 DEFAULT_PATH_FRAMES = 120
 """Default number of frames of a generated path such as a turntable: five seconds at 24 fps."""
@@ -81,6 +84,7 @@ def choose_shot(
     lenses: Lenses = "undistort",
     applied: Collection[str] = (),
     distort: bool = False,
+    up: Float64 | None = None,
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
@@ -89,6 +93,7 @@ def choose_shot(
     size, usd_camera, lenses: as in `read_shot`.
     applied: names of the USD stage's settings that the caller applies itself, so that they need no warning.
     distort: use the photographs' own cameras, including the distortion of their lenses.
+    up: up direction (3,) of the cameras' frame, for --path; None to estimate it.
     Raises InputError.
     """
     if count is not None and path is None:
@@ -108,7 +113,7 @@ def choose_shot(
         shot = shot.without_optics()
         unapplied = (*shot.unapplied, *window_named(shot.window))
         near, told = _without_strays(shot.frames, cameras)
-        shot = Shot(_path(path, near, count), (*shot.warnings, *told), unapplied=unapplied)
+        shot = Shot(_path(path, near, count, up), (*shot.warnings, *told), unapplied=unapplied)
     if applied:
         shot = replace(shot, unapplied=tuple(text for text in shot.unapplied if text.partition(" (")[0] not in applied))
     return shot
@@ -169,9 +174,11 @@ def shot_around(
     size: tuple[int | None, int | None] = (None, None),
     up: str | None = None,
     own: Sequence[Camera] = (),
+    level: bool = False,
 ) -> Shot:
     """Return the shot that --path, --count and --up ask for if --cameras is not given.
 
+    level: True if up is -y in the frame of the cameras `own`; otherwise it is estimated.
     The path goes among the photographs' cameras `own` if these are known and `up` is None. Otherwise it goes around the
     model, as in `cameras_around`. Raises InputError.
 
@@ -182,7 +189,7 @@ def shot_around(
     path = check_around(path, among_own=among_own)
     _check_count(count)
     if among_own:
-        return Shot(_path(path, among(own, size), count))
+        return Shot(_path(path, among(own, size), count, np.array(COLMAP_UP) if level else None))
     found = cameras_around(gaussians, COLMAP_UP if up is None else parse_up(up), size)
     return Shot(_path(path, found, count))
 
@@ -208,8 +215,8 @@ def _check_count(count: int | None) -> None:
         raise InputError(f"--count {count}: expected 1 to {MAX_SHOT_FRAMES:,} frames")
 
 
-def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Frame, ...]:
-    return numbered(PATH_GENERATORS[path](cameras, DEFAULT_PATH_FRAMES if count is None else count))
+def _path(path: str, cameras: Sequence[Camera], count: int | None, up: Float64 | None = None) -> tuple[Frame, ...]:
+    return numbered(PATH_GENERATORS[path](cameras, DEFAULT_PATH_FRAMES if count is None else count, up))
 
 
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
+from clsplat.config.pictures import HOLDOUT_SURFACE_FIELDS
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 from clsplat.device.profile import stage

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
@@ -83,7 +84,17 @@ class HeldModel:
             self._held = {key: (self._held[key][0], {})}  # free the device memory of all other models
             return self._picture(key, camera, look, exact=exact)
 
+    def depths(self, camera: Camera, look: Look) -> tuple[Float32, Float32]:
+        """Render median depths along the camera's axis (world units) and alpha, each (H, W). Raises CapacityError."""
+        renderer, gaussians = self._prepared(look.changes(self.gaussians.sh_degree), exact=True)
+        return _depths(renderer, gaussians, camera)
+
     def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
+        renderer, gaussians = self._prepared(key, exact=exact)
+        return render_picture(renderer, gaussians, camera, look, self.background, self.space)
+
+    def _prepared(self, key: Look | None, *, exact: bool) -> tuple[Renderer, Gaussians]:
+        """Return a renderer, and the model with the edits `key`."""
         if key not in self._held:
             self._held[key] = (self.gaussians if key is None else edited(self.gaussians, key), {})
         gaussians, renderers = self._held.pop(key)
@@ -93,7 +104,7 @@ class HeldModel:
         renderer = renderers.get(exact)
         if renderer is None:
             renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
-        return render_picture(renderer, gaussians, camera, look, self.background, self.space)
+        return renderer, gaussians
 
 
 class LiveModel:
@@ -125,10 +136,8 @@ class LiveModel:
         trainer.settle()
         degree = round(trainer.parameters.coefficients**0.5) - 1
         key = look.changes(degree)
-        if (key is not None or look.mode in ("depth", "count")) and (
-            trainer.device.memory.limit is not None or any(trainer.plan.pieces)
-        ):
-            raise InputError("the training leaves no memory for this: only unedited colour and alpha can be shown")
+        if key is not None or look.mode in ("depth", "count"):
+            self._check_memory()
         if key is None:
             local = trainer.local(camera)
             return render_picture(self._renderer, trainer.complete_parameters, local, look, self.background, self.space)
@@ -137,8 +146,25 @@ class LiveModel:
         self._other = self._other or Renderer(trainer.device, config=trainer.config.rasterizer)
         return render_picture(self._other, self._edited[1], camera, look, self.background, self.space)
 
+    def depths(self, camera: Camera, look: Look) -> tuple[Float32, Float32]:  # noqa: ARG002  # of the whole model
+        """Render depths and alpha like `HeldModel.depths`. Raises InputError if training leaves no memory."""
+        trainer = self.trainer
+        trainer.settle()
+        self._check_memory()
+        return _depths(self._renderer, trainer.complete_parameters, trainer.local(camera))
+
+    def _check_memory(self) -> None:
+        """Raise InputError if the training leaves no memory for other pictures than unedited colour and alpha."""
+        if self.trainer.device.memory.limit is not None or any(self.trainer.plan.pieces):
+            raise InputError("the training leaves no memory for this: only unedited colour and alpha can be shown")
+
 
 Model = HeldModel | LiveModel
+
+
+def _depths(renderer: Renderer, model: Gaussians | AnyGaussians, camera: Camera) -> tuple[Float32, Float32]:
+    frame, channels = renderer.render_channels(model, camera, contiguous=False)
+    return channels["median"], frame.alpha
 
 
 def render_picture(

@@ -30,8 +30,9 @@ from clsplat.viewer.appearance import (
     colour_picture,
     read_look,
 )
+from clsplat.viewer.measure import MAX_LENGTH_METRES, Measurement, point_at
 from clsplat.viewer.path_recorder import add_key, path_document, save_path
-from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS, MAX_PAGE_SIDE_PX, Pose, Start, leaning, wide_enough
+from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS, MAX_PAGE_SIDE_PX, Pose, Start, fitted, leaning, wide_enough
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -81,6 +82,7 @@ class ViserPage:
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
         self.keys: list[Pose] = []
+        self.measurement = Measurement()
         self._status: Any = None
         self._shown = 0
         self._drawing, self._drawn = 0, threading.Lock()
@@ -115,7 +117,12 @@ class ViserPage:
             scene.add_frame(name, show_axes=False)
         self._status = gui.add_markdown("")
         tabs = gui.add_tab_group()
-        for name, add in (("View", self._add_view), ("Path", self._add_path), ("Screenshot", self._add_screenshot)):
+        for name, add in (
+            ("View", self._add_view),
+            ("Path", self._add_path),
+            ("Screenshot", self._add_screenshot),
+            ("Measure", self._add_measure),
+        ):
             with tabs.add_tab(name):
                 add(gui)
 
@@ -292,6 +299,47 @@ class ViserPage:
             self.viewing.ask(self.viewer, lambda model: self.screenshot(model, size))
 
         take.on_click(taken)
+
+    def _add_measure(self, gui: Any) -> None:
+        pick = gui.add_button("Pick two points")
+        metres = gui.add_number("Length in metres", 0.0, min=0.0, max=MAX_LENGTH_METRES, step=0.001)
+        result = gui.add_markdown("")
+
+        def show() -> None:
+            result.content = self.measurement.text(float(metres.value))
+
+        async def begun(_: Any) -> None:
+            self.measurement.points = []
+            self.client.scene.remove_by_name("/measure")
+            show()
+            if not pick.disabled:
+                pick.disabled = True  # until two points are clicked
+                self.client.scene.on_click()(clicked)
+
+        async def clicked(event: Any) -> None:
+            place = float(event.screen_pos[0]), float(event.screen_pos[1])
+            self.viewing.ask(self.viewer, lambda model: measured(model, place))
+
+        def measured(model: Model, place: tuple[float, float]) -> None:
+            if (pose := self.viewer.pose) is None:
+                return
+            camera = pose.camera().resized(*fitted(pose.width, pose.height, 1.0, model.pixels))
+            self.measurement.add(point_at(camera, *model.depths(camera, self.viewer.look), place))
+            self._draw_measure()
+            if len(self.measurement.points) == 2:
+                self.client.scene.remove_click_callback(clicked)
+                pick.disabled = False
+            show()
+
+        async def changed(_: Any) -> None:
+            show()
+
+        pick.on_click(begun)
+        metres.on_update(changed)
+
+    def _draw_measure(self) -> None:
+        points = np.stack(self.measurement.points) - self.world.origin
+        self.client.scene.add_line_segments("/measure", points[[[0, -1]]], colors=CAMERA_COLOURS["key"], line_width=3.0)
 
     def _add_size(self, gui: Any) -> tuple[Any, Any]:
         def add_side(name: str, usual: int) -> Any:

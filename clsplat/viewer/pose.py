@@ -14,8 +14,9 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera, focal_length
 from clsplat.images.video import MAX_VIDEO_SIDE_PX
 from clsplat.rotations import quaternion_of, rotation_from_quaternion
+from clsplat.scenes.orientation.level import COLMAP_UP, focus_point, up_axis
 from clsplat.scenes.outliers import stray_cameras
-from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at, up_axis
+from clsplat.shots.viewpoints import extent_of, look_at
 
 MAX_PAGE_PICTURE_PIXELS = 4096 * 2304
 """Maximum number of pixels of a picture on a page, for any size that a browser requests."""
@@ -131,17 +132,19 @@ def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
     return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), MAX_START_FOV_Y_RADIANS)) if more > 1 else fov
 
 
-def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
+def start_of(cameras: Sequence[Camera], points: Float64, *, level: bool = False) -> Start:
     """Choose the viewer's start: the pose of the first camera that is not an outlier.
 
     The orbit centre is in front of this camera, at the depth of the point that all cameras look at.
 
     Without cameras, the start is in front of the points (N, 3), with y down and z forward as in a COLMAP scene.
+    level: True if up is -y; otherwise it is estimated from the cameras.
     All vectors are in world coordinates.
     """
     if cameras:
         cameras = [camera for camera, far in zip(cameras, stray_cameras(cameras), strict=True) if not far]
-        first, focus, up = cameras[0], focus_point(cameras), up_axis(cameras)
+        first, focus = cameras[0], focus_point(cameras)
+        up = np.array(COLMAP_UP) if level else up_axis(cameras)
         ahead = first.rotation[2]
         distance = float((focus - first.position) @ ahead)
         away = float(np.linalg.norm(focus - first.position))

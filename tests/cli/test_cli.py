@@ -22,6 +22,7 @@ from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.runs.run import Run
+from clsplat.scenes.orientation.frame_record import SOURCE_FRAME
 from clsplat.scenes.sfm.reconstruct import SfmSettings
 
 
@@ -147,7 +148,7 @@ def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
         == 0
     )
     captured = capsys.readouterr()
-    assert json.loads(captured.out) == {"photos": 3}
+    assert json.loads(captured.out) == {"photos": 3, "frame": SOURCE_FRAME.document()}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
     options = {"threads": None, "overwrite": False, "masks": None, "frames": None}
     assert calls == [(folder, SfmSettings("sequential", "auto", mapper="global"), options)]

@@ -358,6 +358,7 @@ def task_of(monkeypatch):
         tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
 
     monkeypatch.setattr(sfm, "run_worker", run)
+    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
     monkeypatch.setattr(sfm, "move_into_place", move)
 
     def stage(_images, _paths, target, *_):

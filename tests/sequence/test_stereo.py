@@ -22,8 +22,7 @@ from rendered import camera_file, pixels_of
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.cli.render.job import check_warps
-from clsplat.config.holdout import HoldoutConfig
-from clsplat.config.pictures import PictureConfig, WarpConfig
+from clsplat.config.pictures import HoldoutConfig, PictureConfig, WarpConfig
 from clsplat.config.stereo import EYES, StereoConfig
 from clsplat.errors import InputError
 from clsplat.images.stmap import write_stmap

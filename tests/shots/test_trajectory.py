@@ -6,8 +6,9 @@ import pytest
 from calls import refuses
 
 from clsplat.camera import Camera
+from clsplat.scenes.orientation.level import focus_point, up_axis
 from clsplat.shots.generated import turntable
-from clsplat.shots.viewpoints import covered_arc, focus_point, look_at, up_axis
+from clsplat.shots.viewpoints import covered_arc, look_at
 
 
 def rotated_world(seed):

@@ -22,6 +22,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images import frame_files as layers
 from clsplat.runs.run import Run
+from clsplat.scenes.orientation.frame_record import SOURCE_FRAME
 from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read
@@ -93,6 +94,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         unit: float = 1.0
         extent = 1.0
         unit_differs = False
+        frame = SOURCE_FRAME
 
         @property
         def train_views(self) -> list[FakeView]:

@@ -20,10 +20,12 @@ from tiny import CONFIG, cameras
 from viewer_browser import SLOW, choose, clsplat
 
 from clsplat.cli.main import main
+from clsplat.config.orientation import parse_scale
 from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
 from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.orientation.known_length import metres_per_unit
 from clsplat.shots import choose_shot
 from clsplat.viewer.pose import start_of
 
@@ -238,6 +240,36 @@ def test_up_and_roll(browser: Any, served: tuple[str, Path], tmp_path: Path) -> 
             across, below = roll_of(page, tmp_path)
             assert abs(across @ axis) < 1e-3
             assert below @ axis < 0
+    finally:
+        page.close()
+
+
+@pytest.mark.slow
+def test_two_clicks_and_a_length_give_a_flag(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
+    page = opened(browser, served[0])
+    try:
+        picture(page, kept(tmp_path, "start.png"))
+        page.get_by_role("tab", name="Measure").click()
+        page.get_by_role("button", name="Pick two points").click()
+        page.get_by_text("Click on a point.").wait_for()
+        page.mouse.click(PAGE["width"] / 2 - 60, PAGE["height"] / 2)
+        page.get_by_text("Click on a second point.").wait_for()
+        page.mouse.click(PAGE["width"] / 2 + 40, PAGE["height"] / 2 + 30)
+        page.get_by_text("Enter its length in metres").wait_for()
+        field = page.get_by_label("Length in metres", exact=True)
+        field.fill("1.25")
+        field.press("Enter")
+        page.get_by_text(re.compile(r"--scale=.*=1\.25")).wait_for()
+        page.screenshot(path=kept(tmp_path, "measured.png"))
+        text = page.inner_text("body")
+        distance = float(re.findall(r"Distance: (\S+) world units", text)[0])
+        rule = parse_scale(re.findall(r"--scale=(\S+)", text)[0])
+        assert rule is not None
+        assert 1.25 / metres_per_unit(rule, {}) == pytest.approx(distance, rel=1e-4)
+        assert 0.1 < distance < 4  # the model is a ball of radius 1
+        page.mouse.click(PAGE["width"] / 2, PAGE["height"] / 2)  # the third click picks nothing
+        page.wait_for_timeout(1000)
+        assert f"Distance: {distance:.6g} world" in page.inner_text("body")
     finally:
         page.close()
 

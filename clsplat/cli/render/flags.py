@@ -13,7 +13,6 @@ from tyro.conf import arg
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
 from clsplat.cli.render.help_page import RENDER_GROUPS
 from clsplat.config.channels import in_words
-from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import (
     DEFAULT_EXR_DEPTH,
     ColourConfig,
@@ -21,6 +20,7 @@ from clsplat.config.pictures import (
     DeepConfig,
     ExrDepth,
     FramingConfig,
+    HoldoutConfig,
     Parts,
     SamplingConfig,
     VideoConfig,

@@ -12,8 +12,15 @@ from clsplat.camera import Camera
 from clsplat.cli.render.flags import RenderVerb
 from clsplat.config.channels import CRYPTOMATTE_CHANNELS
 from clsplat.config.checks import parse_bytes
-from clsplat.config.holdout import HoldoutConfig
-from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig, WarpConfig
+from clsplat.config.pictures import (
+    ColourConfig,
+    DeepConfig,
+    Encoding,
+    HoldoutConfig,
+    PictureConfig,
+    VideoConfig,
+    WarpConfig,
+)
 from clsplat.device.selection import find_device, list_devices
 from clsplat.errors import InputError, warn
 from clsplat.images.alpha import background_colour

@@ -13,14 +13,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.config.masks import MaskUse
+from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import move_into_place
 from clsplat.files.documents import is_file
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
+from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.framing import scale_new, set_frame, turn_new
 from clsplat.scenes.sfm.pipeline.pairs import SFM_MATCHINGS
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
 from clsplat.scenes.sfm.weights import learned_weights
@@ -63,6 +66,8 @@ class SfmSettings:
     features: "sift", or "aliked", learned features.
     weights: for "aliked" the file of the network, or a name in `weights.WEIGHTS_BY_NAME`; None for the default name.
     seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.
+    frame: how the frame of the result is set. By default a new result is turned upright, and an earlier one keeps its
+        frame. The cameras do not depend on it, so that an earlier result is used again in another frame.
     """
 
     matching: Matching = "auto"
@@ -74,6 +79,7 @@ class SfmSettings:
     mapper: Mapper = "auto"
     features: Features = "sift"
     weights: str | None = None
+    frame: FrameUse = AS_IN_FILES
 
     def check(self) -> None:
         """Raise InputError for an unknown choice, and for weights that are not used."""
@@ -87,6 +93,7 @@ class SfmSettings:
                 raise InputError(f"{name} {given!r}: expected one of {', '.join(choices)}")
         if self.weights is not None and self.features == "sift":
             raise InputError(f"--weights {self.weights}: SIFT features have no weights, expected --features aliked")
+        self.frame.check()
 
     def __str__(self) -> str:
         """Return the values of the settings in one line, for the fingerprint of a result."""
@@ -116,8 +123,9 @@ def reconstruct(
         output (`video_frames.frames_folder`), and used like photographs. A folder that `take_frames` wrote counts as
         the videos.
 
-    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
-    folder is created when all files are complete. An existing result for the same photographs and settings is reused.
+    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points; frame.json has the
+    transform from COLMAP's frame) and `sfm.json`. The folder is created when all files are complete. An existing result
+    for the same photographs and settings is reused.
 
     threads: number of CPU threads; None for one per core.
     overwrite: replace a result of other photographs.
@@ -146,6 +154,7 @@ def reconstruct(
     fingerprint = sfm_photos.fingerprint(images, paths, described)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
+        set_frame(output, images, settings.frame, output)
         return output
     _require_enough(images, len(paths) + len(videos.paths))
     for why, others in left_out.items():
@@ -166,6 +175,7 @@ def reconstruct(
             raise InputError(answer["refused"])
         if "failure" in answer:
             raise InputError(_no_model(images, len(photos), answer["failure"]))
+        turn_new(work / "result", images, settings.frame, images)
         _write_record(work / "result", fingerprint, photos, answer["result"])
         _warn_of_losses(images, photos, answer["result"], work / "result" / "images", masks)
         if told := focal_lengths.told(answer["result"].get("focal_lengths", ())):
@@ -173,6 +183,7 @@ def reconstruct(
         move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+    scale_new(output, images, settings.frame)
     return output
 
 
@@ -391,7 +402,8 @@ def _sizes(result: Path) -> dict[str, int]:
     """Return the size in bytes of each file of a result. The keys are paths relative to the result."""
     folders = (result / "images", result / "sparse", result / "masks")
     paths = (path for folder in folders for path in folder.rglob("*"))
-    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
+    files = [path for path in sorted(paths) if path.name != FRAME_RECORD_FILE and is_file(path)]
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in files}
 
 
 def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:

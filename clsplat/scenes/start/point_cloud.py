@@ -20,6 +20,7 @@ from clsplat.camera import Camera
 from clsplat.config.points import SKY_RADIUS_RATIO, StartPoints
 from clsplat.errors import InputError, warn
 from clsplat.images.alpha import composite
+from clsplat.models.edit import moved
 from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of
 from clsplat.scenes.outliers import MAX_OUTLIER_POINT_FRACTION, OUTLIER_DISTANCE_RATIO, strays
 from clsplat.scenes.point_files import UNCOLOURED_GREY, Cloud, of_one_colour, read_cloud
@@ -83,7 +84,7 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
     points, colors, grey = scene.points, scene.point_colors, np.zeros(len(scene.points), np.bool_)
     if start.file:
         path = Path(start.file)
-        cloud = read_cloud(path)
+        cloud = _in_world(read_cloud(path), scene)
         check_place(cloud.points, scene, path)
         kept = without_stray_points(cloud.points, scene, path)
         if not kept.all():
@@ -115,7 +116,7 @@ def with_cloud_beside(scene: Scene) -> Scene:
     """
     for index, path in enumerate(scene.clouds):
         try:
-            cloud = read_cloud(path)
+            cloud = _in_world(read_cloud(path), scene)
             check_place(cloud.points, scene, path)
         except InputError as error:
             warn(f"{error}; it is not used")
@@ -124,6 +125,12 @@ def with_cloud_beside(scene: Scene) -> Scene:
         colors = np.full(cloud.points.shape, UNSEEN_GREY, np.float32) if cloud.colors is None else cloud.colors
         return replace(scene, points=cloud.points, point_colors=colors, clouds=scene.clouds[index + 1 :])
     return replace(scene, clouds=()) if scene.clouds else scene
+
+
+def _in_world(cloud: Cloud, scene: Scene) -> Cloud:
+    """Return the points of a file, which are in the frame of the scene's files, in the scene's frame."""
+    change = scene.world_from_files
+    return cloud if change is None else Cloud(moved(cloud.points, change), cloud.colors)
 
 
 def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:
