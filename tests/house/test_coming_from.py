@@ -55,10 +55,8 @@ def working_folder(scene: Path, trained: Path, tmp_path: Path, monkeypatch: pyte
     size = {"camera_type": "perspective", "render_width": WIDTH, "render_height": HEIGHT, "camera_path": path}
     (tmp_path / "camera_path.json").write_text(json.dumps(size))
     shutil.copyfile(trained / "model.ply", tmp_path / "nerfstudio.ply")
-    data = (trained / "model.ply").read_bytes()
-    (tmp_path / "postshot.ply").write_bytes(
-        data.replace(b"element vertex", b"comment antialiased 1\nelement vertex", 1)
-    )
+    line, with_comment = b"element vertex", b"comment antialiased 1\nelement vertex"
+    (tmp_path / "postshot.ply").write_bytes((trained / "model.ply").read_bytes().replace(line, with_comment, 1))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -68,9 +66,8 @@ def test_every_command_runs(working_folder: Path, capsys: Capture) -> None:
     for index, pixels in enumerate(photographs(range(12), 240, 180)[0]):
         write_pixels(working_folder / f"photos/{index:02}.png", pixels)
     shown = {}
-    for command in sorted(
-        COMMANDS, key=lambda command: " sfm " not in command
-    ):  # those of gsplat's section need a scene
+    # sfm first: gsplat's section, the first one, takes a scene for granted
+    for command in sorted(COMMANDS, key=lambda command: " sfm " not in command):
         verb, *words = shlex.split(command)[1:]
         shown[command] = printed(capsys, [verb, *words, *SMALLER.get(verb, [])]).out
     assert len(shown) == len(COMMANDS) > 14

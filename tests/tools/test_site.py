@@ -71,7 +71,7 @@ def test_pages_have_docstrings_examples_formulas_and_decisions(copy: Path) -> No
     assert 'href="decisions/index.html"' in pages["docs/architecture.html"]
     assert not (copy / "docs/decisions/README.md").exists()
     # artefacts of GitHub Pages leave out what is hidden
-    assert [path for path in copy.glob("out/**/.*")] == []
+    assert list(copy.glob("out/**/.*")) == []
     assert 'href="../github/workflows/test.yml"' in pages["docs/drivers.html"]
     # nothing comes from another host, and there is no list of versions
     loaded = [tag for text in pages.values() for tag in re.findall(r"<(?:script|link|img|iframe)[^>]+>", text)]
@@ -104,8 +104,12 @@ def test_what_leads_nowhere_is_an_error(copy: Path, wrong: dict[str, str]) -> No
 @contextlib.contextmanager
 def served(folder: Path) -> Iterator[str]:
     """Address at which the files of a folder are served meanwhile."""
-    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
-    handler.log_message = lambda *_: None  # type: ignore[attr-defined]
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    handler = partial(Handler, directory=str(folder))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
