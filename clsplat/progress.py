@@ -55,7 +55,7 @@ def no_progress(text: str, fraction: float | None = None) -> None:
     """A progress callback that does nothing."""
 
 
-class _Bar:
+class LiveBar:
     """A live progress bar, as a context manager. `live` is None if standard error is not a terminal."""
 
     live: RichProgress | None = None
@@ -84,7 +84,7 @@ class _Bar:
                 self.live.stop()
 
 
-class TrainProgress(_Bar):
+class TrainProgress(LiveBar):
     """Progress of a training of `total` steps. Call it with a `training.loop.StepReport` after some or all steps.
 
     forecast: estimates the remaining time. Without it the remaining steps are assumed to take as long as the last ones.
@@ -184,7 +184,7 @@ class StageProgress:
         print(text, file=sys.stderr, flush=True)
 
 
-class FrameProgress(_Bar):
+class FrameProgress(LiveBar):
     """Progress of frames. Call it with each `sequence.task.Record` when its file is complete.
 
     total: number of frames, skipped ones included.

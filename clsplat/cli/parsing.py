@@ -27,7 +27,8 @@ VERBS = {
     "doctor": "List installed and missing packages, OpenCL drivers, devices and GPUs without a driver, with "
     "installation advice for this system.",
     "demo": "Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable.",
-    "sfm": "Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images.",
+    "capture": "Turn photos or videos into a trained model, with its report, thumbnail and turntable.",
+    "sfm": "Turn photos and videos into a scene: COLMAP's cameras and points, and the undistorted images.",
     "train": "Train a scene.",
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",

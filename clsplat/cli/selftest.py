@@ -31,9 +31,9 @@ SELFTEST_TABLE_HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms",
 class SelftestVerb(Verb):
     """Test every device: build the kernels, compare each stage with its float64 reference and with stored digests.
 
-    The exit status is 1 if a driver cannot be trusted. The verbs train, eval, render, view, bench and demo run a short
-    form of this test when they first use a device. So does convert, if it renders. CLSPLAT_TRUST_DRIVER=1 skips the
-    short form. This verb tests a device's preferred kernel shape even if its driver has failed in this shape before.
+    The exit status is 1 if a driver cannot be trusted. The verbs train, eval, render, view, bench, capture and demo run
+    a short form of this test when they first use a device. So does convert, if it renders. CLSPLAT_TRUST_DRIVER=1 skips
+    the short form. This verb tests a device's preferred kernel shape even if its driver failed in this shape before.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"

@@ -51,7 +51,8 @@ class Services:
     train: Callable[..., Gaussians] = imported("clsplat.api.train")
     renderer: Callable[..., Renderer] = imported("clsplat.rendering.renderer.Renderer")
     open_frame_renderer: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_frame_renderer")
-    run_demo: Callable[..., Evaluation] = imported("clsplat.demo.run.run_demo")
+    run_capture: Callable[..., Evaluation | None] = imported("clsplat.capture.run.run_capture")
+    run_demo: Callable[..., Evaluation | None] = imported("clsplat.demo.run.run_demo")
     write_town: Callable[..., dict[str, Any]] = imported("clsplat.demo.town.writing.write_town")
 
 

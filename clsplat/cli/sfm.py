@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat sfm`: structure from motion, which makes a COLMAP scene from a folder of photos."""
+"""`clsplat sfm`: structure from motion, which makes a COLMAP scene from photos and videos."""
 
 from __future__ import annotations
 
@@ -19,14 +19,26 @@ from clsplat.progress import StageProgress
 
 @dataclass(frozen=True)
 class SfmVerb(Verb):
-    """Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images."""
+    """Turn photos and videos into a scene: COLMAP's cameras and points, and the undistorted images."""
 
-    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder with the photos, searched with its sub-folders."""
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS|VIDEO")]
+    """Folder with photos, videos or both, searched with its sub-folders; or a video. Each video is a camera. HEIC, AVIF
+    and raw files need pip install 'clsplat[photos]'."""
     output: Output
-    """Folder for the scene."""
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match every pair of photos, or only neighbours in name order (for video). auto: every pair up to 100 photos."""
+    """Folder for the scene. The frames of videos are written to a folder beside it, NAME_frames."""
+    frames: OptionalInt = None
+    """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: by
+    length and motion, at most 300."""
+    mapper: Literal["auto", "global", "incremental"] = "auto"
+    """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed."""
+    features: Literal["sift", "aliked"] = "sift"
+    """Features to match. aliked: features of a neural network, which needs the extra `learned`."""
+    weights: Annotated[str | None, arg(metavar="PATH")] = None
+    """Network of --features aliked: an ONNX file, or a name to fetch, aliked-n16rot or aliked-n32. If not given:
+    aliked-n16rot. If it cannot be fetched within 30 seconds, SIFT features are used."""
+    matching: Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"] = "auto"
+    """Pairs of photos to match: all, neighbours in name order or in a video, the nearest by GPS, or the most similar.
+    auto: all up to 40 photos, neighbours and similar frames of videos, near photos with GPS, else similar photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
     """Lens model to fit, by COLMAP's name. The scene's images are undistorted with it. auto: OPENCV for a camera with
     20 photos or more, else SIMPLE_RADIAL."""
@@ -48,9 +60,11 @@ class SfmVerb(Verb):
 
 
 def run(verb: SfmVerb, services: Services) -> int:
-    """Run structure from motion on the folder of photos, and write the scene."""
-    if not verb.photos.is_dir():
-        raise InputError(f"{verb.photos}: no such folder, expected one with photos")
+    """Run structure from motion on the photos and videos, and write the scene."""
+    if verb.frames is not None and verb.frames < 1:
+        raise InputError(f"--frames {verb.frames}: expected at least 1")
+    if not verb.photos.exists():
+        raise InputError(f"{verb.photos}: no such folder or video, expected one with photos")
     if verb.threads is not None and verb.threads < 1:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
     if verb.invert_masks and not verb.masks:
@@ -64,10 +78,18 @@ def run(verb: SfmVerb, services: Services) -> int:
     services.reconstruct(
         verb.photos,
         verb.output,
-        SfmSettings(matching=verb.matching, camera_model=verb.camera_model, seed=verb.seed),
+        SfmSettings(
+            matching=verb.matching,
+            camera_model=verb.camera_model,
+            seed=verb.seed,
+            mapper=verb.mapper,
+            features=verb.features,
+            weights=verb.weights,
+        ),
         threads=verb.threads,
         overwrite=verb.overwrite,
         masks=masks,
+        frames=verb.frames,
         progress=StageProgress(),
     )
     if verb.json:

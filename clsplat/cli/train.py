@@ -18,7 +18,6 @@ from clsplat.cli.eval import print_summary, tell_of_lpips
 from clsplat.cli.options import Flag, Memory, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import parse_bytes
-from clsplat.config.masks import NO_MASKS
 from clsplat.config.presets import Preset, Schedule, bundled, by_passes, steps_made_for
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
@@ -44,7 +43,8 @@ class TrainVerb(Verb):
     """Folder for the run: config.toml, scene.json, model.ply, metrics.jsonl, eval.json, report.html, checkpoints/,
     test/."""
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
-    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos. Not needed with --resume."""
+    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos, videos or both; or a video. Not
+    needed with --resume."""
     resume: Flag = False
     """Continue the run in the output folder."""
     accept_changes: Flag = False
@@ -156,6 +156,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
+    from clsplat.selftest.result import stages_of_training
     from clsplat.training.memory import HostMemory
     from clsplat.training.preparation import check_steps_left
 
@@ -186,7 +187,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
     )
-    stages = _stages(config)
+    stages = stages_of_training(config)
     devices = [services.require(device, stages) for device in devices]
     HostMemory.chosen(verb.max_host_mem, verb.cache, None, verb.scratch).check(scene, config, devices[0])
     verb.output.mkdir(parents=True, exist_ok=True)
@@ -216,29 +217,6 @@ def _flags_of_machine(verb: TrainVerb) -> str:
         "--scratch": verb.scratch,
     }
     return "".join(f" {flag} {shlex.quote(str(value))}" for flag, value in given.items() if value is not None)
-
-
-def _stages(config: TrainConfig) -> tuple[str, ...]:
-    """Return the names of the self-test's stages that training with these settings uses."""
-    from clsplat.selftest.result import (
-        APPEARANCE_STAGES,
-        CHUNK_STAGES,
-        DEPTH_STAGES,
-        LENS_STAGES,
-        MASK_STAGES,
-        POSE_STAGES,
-        TRAINING_STAGES,
-    )
-
-    return (
-        *TRAINING_STAGES,
-        *CHUNK_STAGES,
-        *(() if config.mask_use == NO_MASKS else MASK_STAGES),
-        *(() if config.appearance == "none" else APPEARANCE_STAGES),
-        *(DEPTH_STAGES if config.depth_use else ()),
-        *(POSE_STAGES if config.refine_poses else ()),
-        *(LENS_STAGES if config.refine_lenses else ()),
-    )
 
 
 def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> None:

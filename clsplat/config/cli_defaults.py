@@ -11,3 +11,5 @@ VIEWER_HOST, VIEWER_PORT = "127.0.0.1", 8080
 """Address and port of the viewer's server."""
 DEMO_ITERATIONS = 2000
 """Training steps of `clsplat demo`, which take about a minute on two cores."""
+CAPTURE_ITERATIONS = 7000
+"""Training steps of `clsplat capture`, for which the short schedule is made."""

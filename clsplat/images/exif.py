@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure of a photograph (exposure time, ISO speed, f-number) from its EXIF data.
+"""Exposure of a photograph (exposure time, ISO speed, f-number), its camera and its lens, from its EXIF data.
 
-Orientation: `images/reading.py`.
+Orientation: `images/reading.py`. Of raw photographs, focal length and lens are those that LibRaw finds, which reads
+cameras' MakerNotes too.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 from clsplat.errors import InputError
 from clsplat.images.reading import open_image
@@ -30,3 +32,15 @@ def exposure_of(path: Path) -> float | None:
     speed = next((value for name in _EXIF_ISO_TAGS if (value := spec.get_int_attribute(name, 0)) > 0), 0)
     known = all(0 < value < math.inf for value in (time, stop, speed))
     return math.log2(time * speed / stop**2) if known else None
+
+
+def lens_of(spec: Any) -> tuple[str, ...]:
+    """Return a photograph's camera and lens as texts, "" for what is missing, from OpenImageIO's specification.
+
+    They are the camera's make and model, the lens's model, the focal length in millimetres and its 35 mm equivalent,
+    which tells digital zoom.
+    """
+    focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
+    equivalent = spec.get_int_attribute("Exif:FocalLengthIn35mmFilm", 0)
+    names = (spec.get_string_attribute(name) for name in ("Make", "Model", "Exif:LensModel"))
+    return (*names, f"{focal:.3f}" if focal else "", str(equivalent) if equivalent else "")

@@ -13,22 +13,31 @@ import struct
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples, reason_of
 from clsplat.files.documents import is_file, open_input
 from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
+from clsplat.images.decoders.orientation import turned
+from clsplat.images.decoders.photo_decoders import (
+    DECODED_PHOTO_EXTENSIONS,
+    LOSSY_PHOTO_FORMATS,
+    PHOTO_HEAD_BYTES,
+    decoder_of,
+    without_converted,
+    wrong_contents,
+)
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm"),
+    *DECODED_PHOTO_EXTENSIONS,
+)
 """Lower-case extensions of the images that a search in folders finds. A file given by name may have any extension."""
-
-T = TypeVar("T", bound=np.generic)
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IMAGE_PIXELS = 1 << 28
@@ -114,7 +123,8 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """Return sorted paths of the images in `folder`, recognised by extension. deep: search its sub-folders too.
 
     Hidden files, hidden folders and broken links are left out. Links to folders are followed, but each folder is
-    searched only once. Raises InputError for a folder that cannot be read.
+    searched only once. HEIC, AVIF and raw files are left out if their folder has the same picture in another format.
+    Raises InputError for a folder that cannot be read.
     """
     paths: list[Path] = []
     seen: set[str] = set()
@@ -130,7 +140,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
             for path in (Path(root, name) for name in files)
             if not path.name.startswith(".") and path.suffix.lower() in IMAGE_SUFFIXES and is_file(path)
         ]
-    return sorted(paths)
+    return sorted(without_converted(paths)[0])
 
 
 def cannot_be_searched(error: OSError) -> None:
@@ -163,7 +173,12 @@ def stored_range(path: Path) -> tuple[int, bool]:
     source = open_image(path)
     dtype, kind = np.dtype(str(source.spec().format)), source.format_name()
     source.close()
-    return (int(np.iinfo(dtype).max) if dtype.kind == "u" else 0), kind not in ("jpeg", "jpeg2000", "webp")
+    return (int(np.iinfo(dtype).max) if dtype.kind == "u" else 0), kind not in (
+        "jpeg",
+        "jpeg2000",
+        "webp",
+        *LOSSY_PHOTO_FORMATS,
+    )
 
 
 def read_image(path: Path, *, orient: bool = True) -> Float32:
@@ -223,17 +238,6 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
     return unassociate(result) if has_alpha else result
 
 
-def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
-    """Rotate and mirror an image (H, W, ...) by its EXIF orientation, 1 to 8."""
-    if orientation >= 5:
-        image = image.transpose(1, 0, 2)
-    if orientation in (3, 4, 7, 8):
-        image = image[::-1]
-    if orientation in (2, 3, 6, 7):
-        image = image[:, ::-1]
-    return image
-
-
 def channels_of(spec: Any) -> list[str]:
     """Return each channel's name in upper case; "" for channels after the end of the decoder's list of names."""
     names = [name.upper() for name in spec.channelnames][: spec.nchannels]
@@ -255,22 +259,22 @@ def alpha_of(spec: Any) -> int:
 def open_image(path: Path) -> Any:
     """Open an image and check its header. Returns OpenImageIO's input, which does not premultiply straight alpha.
 
+    HEIF, AVIF and raw photographs, which OpenImageIO does not decode, give a `DecodedPhoto` with the same methods.
+
     Raises InputError if the file is missing, not an image, or has an implausible size.
     """
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
-    hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)
     size = path.stat().st_size
     with open_input(path, "a picture") as file:
-        known = file.read(8).startswith(IMAGE_SIGNATURES)
+        head = file.read(PHOTO_HEAD_BYTES)
+    decoder = decoder_of(path, head)
+    known = decoder is not None or head.startswith(IMAGE_SIGNATURES)
     if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
         raise InputError(
             f"{path}: has {size} bytes, expected a picture in a known format, of at most {MAX_IMAGE_FILE_BYTES} bytes"
         )
-    source = oiio.ImageInput.open(native_name(path), hints)
-    if source is None:
-        raise InputError(f"{path}: does not decode: {one_line(error_of(oiio))}; expected an image")
+    source = decoder.open(path) if decoder else _opened_by_oiio(path, head)
     spec = source.spec()
     shown = max(spec.width, 0) * max(spec.height, 0), max(spec.full_width, 0) * max(spec.full_height, 0)
     floats = max(shown) * spec.nchannels
@@ -281,6 +285,16 @@ def open_image(path: Path) -> Any:
             f"{path}: its header gives {spec.width} x {spec.height} pixels of {spec.nchannels} channels and a display "
             f"window of {spec.full_width} x {spec.full_height}, too many for a file of {size} bytes; is it damaged?"
         )
+    return source
+
+
+def _opened_by_oiio(path: Path, head: bytes) -> Any:
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(native_name(path), hints)
+    if source is None:
+        reason = one_line(error_of(oiio))
+        raise wrong_contents(path, head) or InputError(f"{path}: does not decode: {reason}; expected an image")
     return source
 
 

@@ -28,6 +28,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.sfm.video_frames import reconstruction_folder
 from clsplat.scenes.supervision.masks import after_sfm
 
 MAX_PICTURE_SIDE_PX = 640
@@ -79,10 +80,9 @@ def scene_of(run: Run) -> Scene | str:
     masks = run.config.mask_use
     try:
         if detect(source) == "photos":
-            source = source.resolve()
-            source = source.with_name(f"{source.name}_colmap")
+            source = reconstruction_folder(source.resolve())
             if not source.is_dir():
-                return "the scene is a folder of photos, and its reconstruction no longer exists"
+                return "the scene is a folder of photos or a video, and its reconstruction no longer exists"
             masks = after_sfm(masks, source)
         return load_scene(
             source,

@@ -18,7 +18,9 @@ from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_p
 from clsplat.scenes.photo_names import legible, match
 from clsplat.scenes.point_files import clouds_beside
 from clsplat.scenes.readers import colmap, transforms
+from clsplat.scenes.sfm.video_frames import find_videos
 from clsplat.scenes.sidecar_files import inside
+from clsplat.scenes.video.reading import is_video_name
 
 Kind = Literal["colmap", "blender", "transforms", "photos"]
 
@@ -38,11 +40,16 @@ MAX_HELD_OUT_LIST_BYTES = 64 << 20
 
 
 def detect(path: Path) -> Kind:
-    """Return the layout of a scene's folder or transforms.json. Raises InputError if no layout fits."""
+    """Return the layout of a scene's folder, transforms.json or video. Raises InputError if no layout fits.
+
+    A video, and a folder with photographs, videos or both, has the layout "photos".
+    """
     path = Path(path)
     if path.is_file():
+        if is_video_name(path):
+            return "photos"
         if path.suffix.lower() != ".json":
-            raise InputError(f"{path}: is a file, expected a scene's folder or a transforms.json")
+            raise InputError(f"{path}: is a file, expected a scene's folder, a transforms.json or a video")
         return "blender" if path.name == "transforms_train.json" else "transforms"
     if not path.is_dir():
         raise InputError(f"{path}: no such folder, expected a scene")
@@ -55,11 +62,11 @@ def detect(path: Path) -> Kind:
         return "colmap"
     if (path / "transforms.json").is_file():
         return "transforms"
-    if find_images(path):
+    if find_images(path) or find_videos(path)[0]:
         return "photos"
     raise InputError(
         f"{path}: no images found, nor sparse/, transforms_train.json or transforms.json; expected a COLMAP, Blender, "
-        "nerfstudio or instant-ngp scene, or a folder of photos"
+        "nerfstudio or instant-ngp scene, or a folder of photos or videos"
     )
 
 

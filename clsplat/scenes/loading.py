@@ -29,6 +29,7 @@ from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transf
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
+from clsplat.scenes.sfm.video_frames import reconstruction_folder
 from clsplat.scenes.start.point_cloud import with_cloud_beside, without_stray_points
 from clsplat.scenes.supervision.masks import after_sfm, for_sfm, masks_of
 
@@ -60,7 +61,7 @@ def load_scene(
 ) -> Scene:
     """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
-    path: a folder in a layout that `detect` knows, or a transforms.json.
+    path: a folder in a layout that `detect` knows, a transforms.json, or a video.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
     test_most: maximum number of held-out views. Of more, an even selection is held out. 0 for no maximum.
@@ -74,8 +75,8 @@ def load_scene(
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
 
-    A folder of photographs goes through `clsplat.scenes.sfm.reconstruct` first. An earlier result for the same
-    photographs is reused.
+    A folder of photographs or videos, and a video, goes through `clsplat.scenes.sfm.reconstruct` first. An earlier
+    result for the same photographs is reused.
 
     Raises InputError that names the file for invalid input: see `detect`, `colmap.read_model` and
     `transforms.read_transforms`. Also raises it for listed pictures that are missing or have another size than their
@@ -140,7 +141,7 @@ def _read(
     folder = path
     if kind == "photos":
         photos = path.resolve()
-        folder = work_dir or photos.with_name(f"{photos.name}_colmap")
+        folder = work_dir or reconstruction_folder(photos)
         folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)

@@ -12,7 +12,9 @@ from typing import Protocol
 
 from clsplat.errors import InputError, examples
 
-_INNER_EXTENSION = re.compile(r"\.(?:jpe?g|png|tiff?|webp|bmp|exr|heic|dng)(?=[._-]|\Z)")
+_INNER_EXTENSION = re.compile(
+    r"\.(?:jpe?g|png|tiff?|webp|bmp|exr|hei[cf]|hif|avif|dng|cr[23]|nef|arw|raf|orf|rw2)(?=[._-]|\Z)"
+)
 """Photograph's extension inside the name of a sidecar file, as in IMAGE.jpg.png."""
 
 _TRAILING_NUMBER = re.compile(r"(.*?)([0-9]{1,18})\Z", re.DOTALL)

@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clsplat.config.colour_models import COLOUR_MODELS
+from clsplat.config.masks import NO_MASKS
+from clsplat.config.training import TrainConfig
 
 FORWARD_STAGES = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
 """Stages that render a frame."""
@@ -84,6 +86,19 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
 "N measured" is the largest error in ulp on a device whose operations all round as IEEE 754 demands. The bounds leave
 room for GPUs whose divisions and roots do not. If an operation is wrong, results are off by thousands of ulp.
 """
+
+
+def stages_of_training(config: TrainConfig) -> tuple[str, ...]:
+    """Return the names of the self-test's stages that training with these settings uses."""
+    return (
+        *TRAINING_STAGES,
+        *CHUNK_STAGES,
+        *(() if config.mask_use == NO_MASKS else MASK_STAGES),
+        *(() if config.appearance == "none" else APPEARANCE_STAGES),
+        *(DEPTH_STAGES if config.depth_use else ()),
+        *(POSE_STAGES if config.refine_poses else ()),
+        *(LENS_STAGES if config.refine_lenses else ()),
+    )
 
 
 @dataclass(frozen=True)

@@ -139,12 +139,18 @@ def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
         return output
 
     services = Services(reconstruct=reconstruct)
-    assert main(["sfm", folder, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"], services) == 0
+    assert (
+        main(
+            ["sfm", folder, "-o", str(tmp_path / "out"), "--matching", "sequential", "--mapper", "global", "--json"],
+            services,
+        )
+        == 0
+    )
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
-    options = {"threads": None, "overwrite": False, "masks": None}
-    assert calls == [(folder, SfmSettings("sequential", "auto"), options)]
+    options = {"threads": None, "overwrite": False, "masks": None, "frames": None}
+    assert calls == [(folder, SfmSettings("sequential", "auto", mapper="global"), options)]
     assert "none: no such folder" in rejected(capsys, ["sfm", tmp_path / "none", "-o", tmp_path / "out"])
 
 

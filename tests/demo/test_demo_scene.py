@@ -7,6 +7,7 @@ import pytest
 from calls import refuses
 
 from clsplat.camera import Camera
+from clsplat.capture.folder import CaptureFolder
 from clsplat.demo import measured_view, ray_caster
 from clsplat.demo import run as demo
 from clsplat.shots.viewpoints import look_at
@@ -28,9 +29,21 @@ def test_a_folder_of_somebody_else_is_no_demos(tmp_path, name):
 
 
 def test_a_demos_folder_is_known_again(tmp_path):
-    demo.claim(tmp_path)
+    folder = CaptureFolder(tmp_path, "photos")
+    demo.claim(folder, 30)
     (tmp_path / "run").mkdir()
-    demo.claim(tmp_path)
+    demo.claim(folder, 30)
+    demo.claim(folder, 60)
+    assert folder.asked()["iterations"] == 60
+
+
+def test_a_capture_of_somebody_is_no_demos(tmp_path):
+    folder = CaptureFolder(tmp_path, "photos")
+    asked = {"input": ["/a/photos"], "iterations": 30}
+    folder.claim(asked, "capture")
+    (tmp_path / "run").mkdir()
+    refuses("was made with input /a/photos, not with demo 40; choose another folder$", demo.claim, folder, 30)
+    assert folder.asked() == asked
 
 
 @pytest.mark.slow

@@ -94,7 +94,8 @@ def test_tools_take_their_flags() -> None:
         if not path.is_file():
             wrong.append(call)
         elif path.name != "test":  # which hands them on to pytest
-            parts = [path, ROOT / "tools/bench/measuring.py", *(path.parent.iterdir() if path.stem == "run" else ())]
+            shared = [ROOT / "tools/bench/measuring.py", ROOT / f"tools/ci/{path.stem}_command.py"]
+            parts = [path, *shared, *(path.parent.iterdir() if path.stem == "run" else ())]
             text = "".join(part.read_text("utf-8") for part in parts if part.is_file())
             wrong += [call for flag in flags_in(call) if f'"{flag}"' not in text]
     assert wrong == []

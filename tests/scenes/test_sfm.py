@@ -4,6 +4,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import sqlite3
 import sys
 
 import numpy as np
@@ -24,6 +25,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.scenes.sfm import worker
+from clsplat.scenes.sfm.pipeline import database as sfm_database
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
 PINHOLE = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
@@ -108,7 +110,11 @@ def test_every_pose_is_recovered(scene, pictures):
     assert record["photos"] == len(record["registered"]) == COUNT
     assert record["mean_reprojection_error"] < 0.5
     stages = list(dict.fromkeys(text for text, _ in heard))
-    assert stages == ["reading photos", "finding features", "matching photos", "placing cameras", "undistorting photos"]
+    matched = ["choosing pairs", "matching photos"]
+    assert stages == ["reading photos", "finding features", *matched, "placing cameras", "undistorting photos"]
+    assert (record["matching"], record["pairs"]) == ("exhaustive", COUNT * (COUNT - 1) // 2)
+    assert (record["mapper"], record["features"], record["fragments"]) == ("incremental", "sift", [])
+    assert {"features", "pairs", "matches", "cameras", "undistorting"} == set(record["seconds"])
     placed = [fraction.text for text, fraction in heard if text == "placing cameras"]
     assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras placed", f"{COUNT} of {COUNT} cameras placed")
     assert len(placed) > 3  # they are counted as they come
@@ -145,21 +151,82 @@ def test_same_seed_same_bytes(scene, photos, tmp_path):
         assert (again / "sparse/0" / name).read_bytes() == (scene[0] / "sparse/0" / name).read_bytes(), name
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "choice", [{"mapper": "global"}, {"matching": "retrieval"}, {"matching": "sequential"}, {"matching": "exhaustive"}]
+)
+def test_every_choice_gives_the_same_bytes_twice(choice, photos, tmp_path):
+    settings = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE", **choice)
+    scenes = [sfm.reconstruct(photos, tmp_path / str(threads), settings, threads=threads) for threads in (1, 3)]
+    record = json.loads((scenes[0] / sfm.SFM_RECORD_FILE).read_text())
+    assert len(record["registered"]) == COUNT
+    assert record["mean_reprojection_error"] < 0.5
+    assert choice.items() <= record.items()
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert len({(scene / "sparse/0" / name).read_bytes() for scene in scenes}) == 1, name
+
+
+@pytest.mark.slow
+def test_photographs_of_two_things_are_two_models(pictures, tmp_path):
+    """Mirrored pictures match among themselves, and not with the others."""
+    for index, picture in enumerate(pictures[0]):
+        write_image(tmp_path / f"photos/a {index}.jpg", picture)  # names with spaces
+    for index, picture in enumerate(pictures[0][:6]):
+        write_image(tmp_path / f"photos/b {index}.jpg", picture[:, ::-1])
+    (message,) = warnings_of(lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", PINHOLE))
+    assert "6 photo(s) (b 0.jpg, b 1.jpg, b 2.jpg and 3 more) form a model of their own, with too few" in message
+    assert f"to the {COUNT} photo(s) that are used" in message
+    record = json.loads((tmp_path / "scene" / sfm.SFM_RECORD_FILE).read_text())
+    assert record["fragments"] == [[f"b {index}.jpg" for index in range(6)]]
+    assert len(record["registered"]) == COUNT
+
+
+def test_a_smaller_model_is_named(photos, tmp_path, monkeypatch):
+    def run(task, work, report):
+        (work / "result" / "images").mkdir(parents=True)
+        names = sorted(task["groups"][0])
+        return {"result": {"registered": names[:7], "fragments": [names[7:10], names[10:11]]}}
+
+    monkeypatch.setattr(sfm, "run_worker", run)
+    apart = "form a model of their own, with too few matches to the 7 photo(s) that are used; to join both, add photos"
+    messages = warnings_of(lambda: sfm.reconstruct(photos, tmp_path / "out"))
+    assert [message.split(": ", 1)[1] for message in messages] == [
+        f"3 photo(s) (view_07.jpg, view_08.jpg, view_09.jpg) {apart} in between",
+        f"1 photo(s) (view_10.jpg) {apart} in between",
+        "no camera pose was found for 1 photo(s) (view_11.jpg), which will not be used",
+    ]
+
+
+def test_names_with_spaces_and_of_numbers_keep_their_features(tmp_path):
+    with sqlite3.connect(tmp_path / "a.db") as connection:
+        connection.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE)")
+        connection.executemany("INSERT INTO images VALUES (?, ?)", [(1, "a b.jpg"), (2, "1"), (3, "3")])
+    names = sfm_database.image_names(tmp_path / "a.db")
+    sfm_database.rename_images(tmp_path / "a.db", {image: str(image) for image in names})
+    assert sfm_database.image_names(tmp_path / "a.db") == {1: "1", 2: "2", 3: "3"}
+    sfm_database.rename_images(tmp_path / "a.db", names)
+    assert sfm_database.image_names(tmp_path / "a.db") == names
+
+
 @pytest.mark.parametrize(("count", "threads"), [(worker.MAX_SINGLE_THREAD_PHOTOS, 1), (81, 3)])
-def test_matching_and_mapping_of_few_photos_have_one_thread(count, threads, tmp_path, monkeypatch):
+@pytest.mark.parametrize("mapper", ["global", "incremental"])
+def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threads, tmp_path, monkeypatch):
     """With several threads the bytes differ in one of 70 runs on a busy machine, so that two equal runs show little."""
     names, given = [f"{index}.jpg" for index in range(count)], []
-    monkeypatch.setattr(
-        worker.pycolmap, "match_exhaustive", lambda **all_: given.append(all_["matching_options"].num_threads)
-    )
-    monkeypatch.setattr(
-        worker.pycolmap, "incremental_mapping", lambda **all_: given.append(all_["options"].num_threads) or {}
-    )
-    task = {"photos": tmp_path, "work": tmp_path, "groups": [names], "sequential": False, "threads": 3, "seed": 0}
-    work = worker.Worker(task, io.StringIO())
+    monkeypatch.setattr(worker.matching, "matched_pairs", lambda *_: ("retrieval", [(1, 2)]))
+    for name in ("match_image_pairs", "incremental_mapping", "calibrate_view_graph", "global_mapping"):
+        told = "matching_options" if name.startswith("match") else "options"
+        monkeypatch.setattr(worker.pycolmap, name, lambda told=told, **all_: given.append(all_[told]) or {})
+    monkeypatch.setattr(worker.matching.sfm_database, "image_names", lambda _: {})
+    monkeypatch.setattr(worker.matching.sfm_database, "rename_images", lambda *_: None)
+    settings = sfm.SfmSettings(mapper=mapper)
+    photos = [sfm_photos.Photo(name, 40, 30, ()) for name in names]
+    work = worker.Worker(sfm.sfm_task(settings, photos, [], tmp_path, 3), io.StringIO())
     work.match()
-    work.map(relaxed=False)
-    assert given == [threads, threads]
+    work.map()
+    assert {options.num_threads for options in given if hasattr(options, "num_threads")} == {threads}
+    if mapper == "global":
+        assert given[-1].mapper.num_threads == threads
 
 
 @pytest.mark.slow
@@ -172,12 +239,12 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
         )
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
     write_image(folder / "stray.jpg", noise.repeat(4, axis=0).repeat(4, axis=1))
-    (folder / "phone.heic").write_bytes(b"not read")
+    (folder / "phone.gif").write_bytes(b"not read")
     (folder / "notes.txt").write_text("not a photo")
     # the output may lie among the photos: it must not be taken for some
     output = folder / "scene"
     messages = warnings_of(lambda: sfm.reconstruct(folder, output))
-    assert any("phone.heic" in message for message in messages)
+    assert any("phone.gif" in message for message in messages)
     assert any("stray.jpg" in message and "no camera pose was found" in message for message in messages)
     assert json.loads((output / sfm.SFM_RECORD_FILE).read_text())["unregistered"] == ["stray.jpg"]
 
@@ -250,8 +317,8 @@ def test_what_counts_as_transparent(dtype):
 def test_bad_folders(tmp_path, photos):
     refuses(r"missing: no such folder", sfm.reconstruct, tmp_path / "missing", tmp_path / "out")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty/a.webp").write_bytes(b"")
-    with pytest.raises(InputError, match=r"empty: no photos found, only 1 in unsupported formats such as a\.webp"):
+    (tmp_path / "empty/a.gif").write_bytes(b"")
+    with pytest.raises(InputError, match=r"empty: no photos found, only 1 in unsupported formats such as a\.gif"):
         sfm.reconstruct(tmp_path / "empty", tmp_path / "out")
     (tmp_path / "few").mkdir()
     shutil.copy(photos / "view_00.jpg", tmp_path / "few")
@@ -259,7 +326,10 @@ def test_bad_folders(tmp_path, photos):
     for output, settings, told in [
         (tmp_path, {}, "is neither empty nor a result of sfm"),
         (tmp_path / "few/view_00.jpg", {}, "is a file"),
-        (tmp_path / "out", {"matching": "nearest"}, "expected auto, exhaustive or sequential"),
+        (tmp_path / "out", {"matching": "nearest"}, "expected one of auto, exhaustive, sequential, spatial, retrieval"),
+        (tmp_path / "out", {"mapper": "both"}, "mapper 'both': expected one of auto, global, incremental"),
+        (tmp_path / "out", {"features": "orb"}, "features 'orb': expected one of sift, aliked"),
+        (tmp_path / "out", {"weights": "w.onnx"}, "w.onnx: SIFT features have no weights, expected --features aliked"),
         (tmp_path / "out", {"camera_model": "LENS"}, "camera model 'LENS'"),
     ]:
         refuses(told, sfm.reconstruct, photos, output, sfm.SfmSettings(**settings))
@@ -282,12 +352,12 @@ def task_of(monkeypatch):
 
     def run(task, work, report):
         tasks.append(task)
-        return {"result": {"registered": sorted(name for group in task["groups"] for name in group)}}
+        return {"result": {"registered": sorted(name for group in task["groups"] for name in group), "fragments": []}}
 
     def move(work, output):
         tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
 
-    monkeypatch.setattr(sfm, "_run_worker", run)
+    monkeypatch.setattr(sfm, "run_worker", run)
     monkeypatch.setattr(sfm, "move_into_place", move)
 
     def stage(_images, _paths, target, *_):
@@ -353,8 +423,8 @@ def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkey
 
 def test_camera_groups():
     photo = sfm_photos.Photo
-    wide, tall = photo("a", 40, 30, ()), photo("b", 30, 40, ())
-    zoomed, other = photo("c", 40, 30, ("x", "y", "50")), photo("d", 40, 30, ())
+    wide, tall = photo("a", "a", 40, 30, ()), photo("b", "b", 30, 40, ())
+    zoomed, other = photo("c", "c", 40, 30, ("x", "y", "50")), photo("d", "d", 40, 30, ())
     everything = [wide, tall, zoomed, other]
     assert sfm_photos.camera_groups(everything, "auto") == [["a", "d"], ["b"], ["c"]]
     assert sfm_photos.camera_groups(everything, True) == [["a", "c", "d"], ["b"]]
@@ -417,7 +487,7 @@ def test_photos_with_masks_are_trained_by_their_folder(photos, tmp_path, monkeyp
     alpha = scene.views[0].load()[:, :, 3]
     assert not alpha[: HEIGHT // 4 - 6].any()
     assert alpha[HEIGHT // 4 + 6 :].all()
-    monkeypatch.setattr(sfm, "_run_worker", lambda *_: pytest.fail("reconstructed again"))
+    monkeypatch.setattr(sfm, "run_worker", lambda *_: pytest.fail("reconstructed again"))
     ignored = load_scene(folder, masks=MaskUse("ignore", invert=True)).views[0].load_masked()
     assert not ignored[: HEIGHT // 4 - 6, :, 4].any(), "the same features, so the same reconstruction"
 

@@ -50,9 +50,10 @@ def used(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], tuple[list[str], l
     def run(task: dict[str, Any], work: Path, report: object) -> dict[str, Any]:
         tasks.append(task)
         (work / "result" / "images").mkdir(parents=True)
-        return {"result": {"registered": sorted(name for group in task["groups"] for name in group)}}
+        registered = sorted(name for group in task["groups"] for name in group)
+        return {"result": {"registered": registered, "fragments": []}}
 
-    monkeypatch.setattr(sfm, "_run_worker", run)
+    monkeypatch.setattr(sfm, "run_worker", run)
     monkeypatch.setattr(sfm, "_without_their_alpha", lambda *_: [])
 
     def work(folder: Path) -> tuple[list[str], list[str]]:

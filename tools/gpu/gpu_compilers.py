@@ -19,9 +19,9 @@ from typing import Any
 
 from gpu_assembly import Loop, parse_gcn, parse_sass
 
-from clsplat.device.drivers.driver_records import cache_folder
 from clsplat.device.program import text_of
 from clsplat.errors import ClsplatError
+from clsplat.files.user_cache import cache_folder
 
 CLANG = "19"
 """Version of clang, on which the counts depend. 16 is the first that supports every target."""

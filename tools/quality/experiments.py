@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from quality.camera_choices import cameras as sfm_cameras
 from quality.made_scenes import (
     Changes,
     baked,
@@ -430,6 +431,11 @@ TOWNS = {
     "--own-block": {"action": "store_true", "help": "photographs of --towns count where they show their own block"},
     "--passes": _number(30, "passes through the photographs, if --iterations is 0"),
 }
+CAMERAS: dict[str, Any] = {
+    "--choices": {"default": "auto", "help": "'matching=exhaustive,mapper=global;auto', with semicolons between"},
+    "--threads": {"type": int, "help": "threads of `clsplat sfm`; one per core if not given"},
+    "--psnr": {"action": "store_true", "help": "train each scene as well"},
+}
 EXPERIMENTS = {
     "masks": Experiment(masks, 1, 7000, RESOLUTION),
     "exposure": Experiment(exposure, 1, 2000, {**RESOLUTION, **WITH, **APPEARANCE}),
@@ -441,6 +447,7 @@ EXPERIMENTS = {
     "seeds": Experiment(seeds, "+", 2000, {**RESOLUTION, **WITH, **SEEDS}),
     "orders": Experiment(orders, "+", 3000, {**RESOLUTION, **WITH, **SEEDS}),
     "towns": Experiment(towns, 0, 0, {**WITH, **TOWNS}),
+    "sfm": Experiment(sfm_cameras, "+", 2000, {**RESOLUTION, **CAMERAS}),
     "units": Experiment(units, 1, 300, {**RESOLUTION, "--bound": _number(0.3, "dB")}),
 }
 """The experiments, keyed by name."""

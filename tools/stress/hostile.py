@@ -17,7 +17,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from camera_files import write_avif, write_dng, write_heic
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
+from hostile_videos import make_frames, make_video, read_frames, read_video
 from ksplats import ksplat
 from models import random_gaussians
 from other_pictures import KINDS, other_picture
@@ -40,6 +42,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct
+from clsplat.scenes.video.frames import FRAME_TABLE_FILE
 from clsplat.shots.read import choose_shot
 from clsplat.training import repro_bundle
 
@@ -220,6 +223,8 @@ def make_cameras_json(folder: Path) -> None:
 UNREAD = ("pcx",)
 """Kinds of `other_pictures.KINDS` that OpenImageIO does not open."""
 FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
+CAMERA_WRITERS: dict[str, Callable[[Path, Any], Path]] = {"heic": write_heic, "avif": write_avif, "dng": write_dng}
+HAS_CAMERA_DECODERS = bool(find_spec("pillow_heif") and find_spec("rawpy"))
 
 
 def make_image(folder: Path, extension: str) -> None:
@@ -227,6 +232,12 @@ def make_image(folder: Path, extension: str) -> None:
     pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
     kind = "float" if extension in ("exr", "hdr") else "uint8"
     write_pixels(folder / f"picture.{extension}", pixels, kind, {"Orientation": 6})
+
+
+def make_camera_image(folder: Path, extension: str) -> None:
+    """Write a picture in a format of phones and cameras."""
+    pixels = np.random.default_rng(2).integers(0, 256, (28, 36, 3), np.uint8)
+    CAMERA_WRITERS[extension](folder / f"picture.{extension}", pixels)
 
 
 def make_other_image(folder: Path, kind: str) -> None:
@@ -431,6 +442,10 @@ _ALL = (
         for each in FORMATS
     ),
     *(
+        _one_file(f"image-{each}", f"picture.{each}", partial(make_camera_image, extension=each), read_picture, BYTES)
+        for each in (CAMERA_WRITERS if HAS_CAMERA_DECODERS else ())
+    ),
+    *(
         _one_file(f"other-{kind}", "picture.png", partial(make_other_image, kind=kind), read_picture, BYTES, 0.3)
         for kind in KINDS
         if kind not in UNREAD
@@ -441,6 +456,8 @@ _ALL = (
     _one_file("bundle", "trouble-step-0000007.npz", make_bundle, repro_bundle.read_bundle, ARCHIVE, 2),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), BINARY, 1),
     Reader("record", make_record, read_record, ("sfm.json",), DOCUMENT, 1),
+    *(Reader("video", make_video, read_video, ("walk.mp4",), BINARY, 1) for _ in range(bool(find_spec("av")))),
+    Reader("frames", make_frames, read_frames, (f"frames/{FRAME_TABLE_FILE}",), DOCUMENT, 1),
     *(
         _saved(name, TEXT if name == "model.compressed.ply" else BINARY)
         for name in ("model.splat", "model.compressed.ply", "model.spz", "model.sog", "model.glb")

@@ -67,6 +67,7 @@ TRAIN = " ".join(["train {scene} -o {out}/run --iterations", str(LONG), *(word o
 VERBS = (
     Verb("devices", "devices", "pyopencl", writes=False),
     Verb("demo", "demo -o {out}/demo --iterations 100", "/demo/photos"),
+    Verb("capture", "capture {photos} -o {out}/shot --iterations 100", "/shot/.scene-sfm-*/database.db"),
     Verb("sfm", "sfm {photos} -o {out}/scene", "/.scene-sfm-*/database.db"),
     Verb("train", TRAIN, "/run/metrics.jsonl"),
     Verb("eval", "eval {out}/run", "clsplat.progress"),
@@ -141,7 +142,7 @@ class Bench:
         self.names = {name: str(folder / name) for name in ("scene", "photos", "run", "other")}
         self.names.update(model=str(folder / "run" / "model.ply"), cache=str(folder / "cache"))
         write_scene(folder / "scene")
-        if any(verb.name == "sfm" for verb in verbs):
+        if any("{photos}" in verb.words for verb in verbs):
             from clsplat.demo.ray_caster import write_photos
 
             write_photos(folder / "photos", count=12, width=320, height=240)

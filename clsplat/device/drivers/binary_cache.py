@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cache of built OpenCL programs (binaries) in files, for a driver that has no cache of its own.
 
-The files are in the folder CLSPLAT_BINARIES, or else in `binaries` of `driver_records.cache_folder`.
+The files are in the folder CLSPLAT_BINARIES, or else in `binaries` of `user_cache.cache_folder`.
 
 A file begins with a digest of its contents, as a driver may crash on a truncated binary. The file's name is a digest of
 everything that the binary depends on: the text, the options, the driver and its settings, and the processor.
@@ -21,9 +21,9 @@ from pathlib import Path
 import pyopencl as cl
 
 from clsplat.device.drivers.cpu_name import features
-from clsplat.device.drivers.driver_records import cache_folder
 from clsplat.device.drivers.quirks import TARGET_VARIABLE_PREFIX, wants_cache
 from clsplat.files.atomic import atomic_write
+from clsplat.files.user_cache import cache_folder
 
 MAX_BINARY_CACHE_BYTES = 256 << 20
 """Maximum bytes of all files of the cache. Beyond it, the least recently used files are removed. A binary takes 30 to

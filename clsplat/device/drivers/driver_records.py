@@ -26,6 +26,7 @@ from clsplat.errors import reason_of
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import parse_json
 from clsplat.files.locks import briefly_locked
+from clsplat.files.user_cache import cache_folder
 from clsplat.version import package_version
 
 BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
@@ -50,14 +51,6 @@ class Entry:
     kernels: Mapping[str, str] = field(default_factory=dict)
     failed: str | None = ""
     trial: Mapping[str, Any] = field(default_factory=dict)
-
-
-def cache_folder() -> Path:
-    """Return $XDG_CACHE_HOME/clsplat or ~/.cache/clsplat; without a home folder, a path that cannot be written to."""
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
-    except RuntimeError:
-        return Path(os.devnull) / "clsplat"
 
 
 def memory_path() -> Path:

@@ -18,6 +18,7 @@ from clsplat.device.drivers.quirks import most_lanes, subgroup_ways, title
 from clsplat.device.drivers.worker_process import regardless
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files.documents import parse_json
+from clsplat.files.user_cache import cache_folder
 
 VECTOR_LANES = (1, 4, 8, 16)
 """Allowed numbers of pixels per vector."""
@@ -237,7 +238,7 @@ def _parsed(text: str, default: Shape) -> Shape | None:
 
 def saved_path() -> Path:
     """The file in which `clsplat tune` saves its results."""
-    return driver_records.cache_folder() / "shapes.json"
+    return cache_folder() / "shapes.json"
 
 
 def saved_shapes() -> dict[str, str]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -21,18 +21,27 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.files.atomic import require_room, room_error, write_error
 from clsplat.files.documents import is_file
 from clsplat.files.names import ON_WINDOWS, native_name
-from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_image, opened, turned
+from clsplat.images.decoders.decoded_photo import PHOTOS_EXTRA
+from clsplat.images.decoders.orientation import turned
+from clsplat.images.decoders.photo_decoders import (
+    DECODED_PHOTO_EXTENSIONS,
+    PHOTO_DECODERS,
+    lacks_decoder,
+    without_converted,
+)
+from clsplat.images.exif import lens_of
+from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_image, opened
 from clsplat.images.writing import jpeg_room
 from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 
 SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """Extensions that pycolmap's wheel reads and writes. The wheel's OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+CONVERTED_PHOTO_EXTENSIONS = frozenset({".webp", *DECODED_PHOTO_EXTENSIONS})
+"""Extensions of photographs that are decoded for pycolmap, and written as JPEG, or as PNG if they are transparent."""
 SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
 """OpenImageIO's names of the formats that pycolmap's wheel reads. The format is recognised by the file's contents."""
-UNREADABLE_PHOTO_EXTENSIONS = frozenset(
-    {".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"}
-)
-"""Extensions of photographs that pycolmap's wheel does not read. A warning asks for conversion."""
+UNREADABLE_PHOTO_EXTENSIONS = frozenset({".jp2", ".jxl", ".gif", ".exr"})
+"""Extensions of photographs that structure from motion does not use. A warning asks for conversion."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +49,15 @@ class Photo:
     """A photograph that was decoded and put into the folder that pycolmap reads.
 
     name: path below the folder, with forward slashes.
+    scene_name: path of its copy in the scene, such as IMG_1.heic.jpg for IMG_1.heic.
     width, height: size in pixels of the upright photograph.
-    lens: make, model and focal length from EXIF, empty strings for missing values.
+    lens: camera, lens and focal lengths from EXIF (`images.exif.lens_of`).
     transparent: True if the alpha channel makes any pixel transparent.
     thumb: thumbnail from `copies.thumb_of`, for photographs that may be copies.
     """
 
     name: str
+    scene_name: str
     width: int
     height: int
     lens: tuple[str, ...]
@@ -54,42 +65,55 @@ class Photo:
     thumb: Thumb | None = None
 
 
-def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
+def find_photos(
+    folder: Path, excluded: Collection[Path] = (), *, needed: bool = True
+) -> tuple[list[Path], dict[str, list[Path]]]:
     """Return the photographs below a folder, sorted by name, and the files that are left out, keyed by the reason.
 
-    Hidden files and folders are skipped, as is `excluded` (the output, if it is inside). Raises InputError for a folder
-    that does not exist, cannot be read, or has no photographs.
+    Hidden files and folders are skipped, as are the folders `excluded` (outputs, if they are inside). Raises InputError
+    for a folder that does not exist or cannot be read, and for one without photographs if they are `needed`.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a folder with photos")
-    skip = excluded.resolve() if excluded is not None else None
+    skip = {path.resolve() for path in excluded}
     photos: list[Path] = []
     others: list[Path] = []
+    lacking: list[Path] = []
     broken: list[Path] = []
+    known = SFM_PHOTO_EXTENSIONS | CONVERTED_PHOTO_EXTENSIONS
     for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
         here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != skip]
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
         for name in files:
             extension = Path(name).suffix.lower()
             if name.startswith("."):
                 continue
-            if extension in SFM_PHOTO_EXTENSIONS and not name.isprintable():
+            if extension in known and not name.isprintable():
                 raise InputError(f"{here / name}: its name has unprintable characters; rename it")
-            if extension in SFM_PHOTO_EXTENSIONS and (here / name).is_symlink() and not (here / name).exists():
+            if extension in known and (here / name).is_symlink() and not (here / name).exists():
                 broken.append(here / name)
-            elif extension in SFM_PHOTO_EXTENSIONS:
+            elif lacks_decoder(here / name):
+                lacking.append(here / name)
+            elif extension in known:
                 photos.append(here / name)
             elif extension in UNREADABLE_PHOTO_EXTENSIONS:
                 others.append(here / name)
-    if not photos:
-        kinds = " ".join(sorted(SFM_PHOTO_EXTENSIONS))
+    if not photos and needed:
+        kinds = " ".join(sorted(known))
+        if lacking:
+            found = f"{len(lacking)} photo(s) such as {min(lacking).name}"
+            raise InputError(f"{folder}: has only {found}, and reading them needs another package: {PHOTOS_EXTRA}")
         unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
         unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
         raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
+    _, converted = without_converted([*photos, *lacking])
+    photos = [path for path in photos if path not in set(converted)]
     aside = companions(photos, photos, folder)
     kept = [path for path in photos if path not in aside]
     left_out = {
+        f"reading them needs another package: {PHOTOS_EXTRA}": [path for path in lacking if path not in set(converted)],
+        "their folder has the same photos in another format": converted,
         "convert to JPEG, PNG or TIFF first": others,
         "broken links": broken,
         "their names mark masks, depth maps or the like of other photos": aside,
@@ -117,8 +141,9 @@ def stage_photos(
     """Put a copy of every photograph, or a link to it, under `target`, and decode it once. Returns the photographs.
 
     pycolmap ignores the EXIF orientation and cannot read some formats. So photographs with an orientation, or in such a
-    format, are rewritten upright. Other files are linked, or copied if the file system has no links. Raises InputError
-    that names the first photograph that does not decode, as pycolmap would silently skip it.
+    format, are rewritten upright, with the EXIF data from which pycolmap takes focal lengths and GPS positions. Other
+    files are linked, or copied if the file system has no links. Raises InputError that names the first photograph that
+    does not decode, as pycolmap would silently skip it.
 
     report: function that is called with the fraction of the photographs that are done.
     """
@@ -151,14 +176,17 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
         raise InputError(f"{path}: cannot be decoded as an image: {_last_line(trouble)}")
 
     name = photo_name(folder, path)
-    copy = target / name
+    alpha = alpha_of(spec)
+    transparent = _is_transparent(pixels, alpha)
+    scene_name = _scene_name(name, transparent=transparent)
+    copy = target / scene_name
     copy.parent.mkdir(parents=True, exist_ok=True)
     orientation = spec.get_int_attribute("Orientation", 1)
     width, height = spec.width, spec.height
     if orientation in range(2, 9) or kind not in SFM_IMAGE_FORMATS:
         if orientation in range(5, 9):
             width, height = height, width
-        _write_upright(path, copy, spec)
+        _write_upright(path, copy, spec, pixels if kind in PHOTO_DECODERS else None)
     else:
         try:
             if ON_WINDOWS and not os.access(path, os.W_OK):
@@ -166,11 +194,15 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
             os.link(path.resolve(), copy)
         except OSError:
             shutil.copyfile(path, copy)
-    focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
-    lens = (spec.get_string_attribute("Make"), spec.get_string_attribute("Model"), f"{focal:.3f}" if focal else "")
-    alpha = alpha_of(spec)
     thumb = thumb_of(turned(pixels, orientation), alpha) if name in compared else None
-    return Photo(name, width, height, lens, _is_transparent(pixels, alpha), thumb)
+    return Photo(name, scene_name, width, height, lens_of(spec), transparent, thumb)
+
+
+def _scene_name(name: str, *, transparent: bool) -> str:
+    """Return the name of a photograph's copy, whose extension pycolmap can write. transparent: the copy needs alpha."""
+    if PurePosixPath(name).suffix.lower() in SFM_PHOTO_EXTENSIONS:
+        return name
+    return name + (".png" if transparent else ".jpg")
 
 
 def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
@@ -187,14 +219,20 @@ def has_alpha(path: Path) -> bool:
         return source is not None and alpha_of(source.spec()) >= 0
 
 
-def _write_upright(path: Path, copy: Path, spec: Any) -> None:
+def _write_upright(path: Path, copy: Path, spec: Any, pixels: NDArray[Any] | None) -> None:
     """Write an upright copy of a photograph, in the format of the copy's extension.
 
     EXIF is kept for the focal length, but its orientation is set to upright.
 
     spec: OpenImageIO's specification of the photograph.
+    pixels: the decoded pixels, None if OpenImageIO decodes the photograph.
     """
-    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
+    if pixels is None:
+        stored = oiio.ImageBuf(native_name(path))
+    else:
+        stored = oiio.ImageBuf(spec)
+        assert stored.set_pixels(oiio.ROI(), pixels), stored.geterror()
+    upright = oiio.ImageBufAlgo.reorient(stored)
     upright.specmod().attribute("Orientation", 1)
     upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
     with require_room(copy, jpeg_room(spec)):  # libjpeg would end the process if it could not write
@@ -211,10 +249,10 @@ def _last_line(text: str) -> str:
 
 
 def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[list[str]]:
-    """Group the photographs' names by camera. The photographs of a group share their intrinsics.
+    """Group the photographs' names in the scene by camera. The photographs of a group share their intrinsics.
 
-    shared_camera: True groups all photographs of the same size. "auto" also requires the same make, model and focal
-        length in EXIF. False gives each photograph its own camera.
+    shared_camera: True groups all photographs of the same size. "auto" also requires the same camera, lens and focal
+        lengths in EXIF. False gives each photograph its own camera.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for photo in photos:
@@ -224,5 +262,5 @@ def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[li
             key = (photo.width, photo.height)
         else:
             key = (photo.width, photo.height, *photo.lens)
-        groups.setdefault(key, []).append(photo.name)
+        groups.setdefault(key, []).append(photo.scene_name)
     return list(groups.values())

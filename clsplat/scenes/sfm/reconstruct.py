@@ -3,70 +3,65 @@
 
 from __future__ import annotations
 
-import contextlib
+import hashlib
 import json
 import os
-import queue
 import shutil
-import sqlite3
-import subprocess
-import sys
 import tempfile
-import threading
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 from clsplat.config.masks import MaskUse
-from clsplat.errors import ClsplatError, InputError, examples, warn
+from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import move_into_place
 from clsplat.files.documents import is_file
-from clsplat.process import apart
-from clsplat.progress import CountedFraction, Progress, no_progress
+from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.sfm import copies as sfm_copies
+from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.pipeline.pairs import SFM_MATCHINGS
+from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
+from clsplat.scenes.sfm.weights import learned_weights
+from clsplat.scenes.sfm.worker_progress import run_worker
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
+from clsplat.scenes.video.reading import is_video_name
 
-Matching = Literal["auto", "exhaustive", "sequential"]
+Mapper = Literal["auto", "global", "incremental"]
+Features = Literal["sift", "aliked"]
+Matching = Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"]
 
 SFM_RECORD_FILE = "sfm.json"
 """File in the result that records its photographs and settings, the photographs without a pose, and its quality."""
-MAX_EXHAUSTIVE_PHOTOS = 100
-"""Number of photographs up to which "auto" matches every pair.
-
-The number of pairs grows with the square of the number of photographs, and a CPU matches about 50 pairs per second.
-"""
 MIN_SFM_PHOTOS = 3
 """Minimum number of photographs of a reconstruction."""
 SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 """Choices of `SfmSettings.camera_model`."""
-
-PLACED_CAMERAS_UNIT = "cameras placed"
-"""Unit of the progress of placing cameras, as in "12 of 25 cameras placed"."""
-# Each stage has a text for the user, and a table of the database that gets a row for each photograph or pair.
-_PROGRESS_BY_STAGE = {
-    "features": ("finding features", "keypoints"),
-    "matches": ("matching photos", "two_view_geometries"),
-    "cameras": ("placing cameras", None),
-    "cameras again": ("placing cameras, second try", None),
-    "undistorting": ("undistorting photos", None),
-}
+SFM_MAPPERS = ("auto", "global", "incremental")
+"""Choices of `SfmSettings.mapper`."""
+SFM_FEATURES = ("sift", "aliked")
+"""Choices of `SfmSettings.features`."""
 
 
 @dataclass(frozen=True)
 class SfmSettings:
     """Settings on which the recovered cameras depend.
 
-    matching: "exhaustive" matches every pair, "sequential" matches neighbours in the order of names. "auto" matches
-        every pair of up to 100 photographs, and neighbours of more.
+    matching: the pairs of photographs that are matched. "exhaustive": all. "sequential": neighbours in each video, or
+        in the order of names without videos. "spatial": the nearest by EXIF's GPS. "retrieval": the most similar by
+        their features. "auto": all of up to 40 photographs, else neighbours and similar photographs of videos, near
+        photographs with GPS positions that differ enough, and similar photographs otherwise.
     camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
+    mapper: "incremental" adds one photograph after another. "global" solves for all cameras at once. "auto" is
+        "incremental", and "global" where that places less than 60 % of the photographs.
+    features: "sift", or "aliked", learned features.
+    weights: for "aliked" the file of the network, or a name in `weights.WEIGHTS_BY_NAME`; None for the default name.
     seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.
     """
 
@@ -76,18 +71,28 @@ class SfmSettings:
     max_image_size: int = 1600
     max_features: int = 8192
     seed: int = 0
+    mapper: Mapper = "auto"
+    features: Features = "sift"
+    weights: str | None = None
 
     def check(self) -> None:
-        """Raise InputError for an unknown matching or camera model."""
-        if self.matching not in ("auto", "exhaustive", "sequential"):
-            raise InputError(f"matching {self.matching!r}: expected auto, exhaustive or sequential")
-        if self.camera_model not in SFM_CAMERA_MODELS:
-            raise InputError(f"camera model {self.camera_model!r}: expected one of {', '.join(SFM_CAMERA_MODELS)}")
+        """Raise InputError for an unknown choice, and for weights that are not used."""
+        for name, given, choices in (
+            ("matching", self.matching, SFM_MATCHINGS),
+            ("mapper", self.mapper, SFM_MAPPERS),
+            ("features", self.features, SFM_FEATURES),
+            ("camera model", self.camera_model, SFM_CAMERA_MODELS),
+        ):
+            if given not in choices:
+                raise InputError(f"{name} {given!r}: expected one of {', '.join(choices)}")
+        if self.weights is not None and self.features == "sift":
+            raise InputError(f"--weights {self.weights}: SIFT features have no weights, expected --features aliked")
 
     def __str__(self) -> str:
         """Return the values of the settings in one line, for the fingerprint of a result."""
         lens = f"{self.camera_model} {self.shared_camera}"
-        return f"{self.matching} {lens} {self.max_image_size} {self.max_features} {self.seed}"
+        stages = f"{self.features} {self.matching} {self.mapper}"
+        return f"{stages} {lens} {self.max_image_size} {self.max_features} {self.seed}"
 
 
 DEFAULT_SFM_SETTINGS = SfmSettings()
@@ -101,9 +106,15 @@ def reconstruct(
     threads: int | None = None,
     overwrite: bool = False,
     masks: MaskUse | None = None,
+    frames: int | None = None,
+    frames_to: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
+
+    images: a folder with photographs, videos or both; or a video. Frames of videos are written to a folder beside the
+        output (`video_frames.frames_folder`), and used like photographs. A folder that `take_frames` wrote counts as
+        the videos.
 
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
     folder is created when all files are complete. An existing result for the same photographs and settings is reused.
@@ -112,46 +123,68 @@ def reconstruct(
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
+    frames: number of frames of each video; None for a number by its length and motion.
+    frames_to: folder for the frames; None for a folder beside the output.
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
-    Warns of copies, and of photographs that get no pose, have an unreadable format, or lost their alpha. Raises
-    InputError for a folder without photographs, a photograph that does not decode, and an existing output that must not
-    be replaced. Also raises InputError if the cameras cannot be recovered. Raises ClsplatError if pycolmap fails. After
-    KeyboardInterrupt no files remain.
+    Warns of copies, of photographs that get no pose, have an unreadable format, or lost their alpha, and of focal
+    lengths that differ from EXIF's. Raises InputError for a folder without photographs, a photograph that does not
+    decode, and an existing output that must not be replaced. Also raises InputError if the cameras cannot be recovered.
+    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain.
     """
     report = progress or no_progress
     settings.check()
-    paths, left_out = sfm_photos.find_photos(images, excluded=output)
+    videos = frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to)
+    paths, left_out = videos.photos_beside(images, output)
     copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
     paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
     mask_files = _masks(images, paths, masks)
-    fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, mask_files)}")
+    settings, weights = _with_weights(settings)
+    described = f"{settings}{_described(masks, mask_files)}{_identity(weights)}{videos.fingerprint}"
+    fingerprint = sfm_photos.fingerprint(images, paths, described)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
         return output
-    _require_enough(images, len(paths))
+    _require_enough(images, len(paths) + len(videos.paths))
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
-        warn(f"{images}: {_listed(names)} left out: {why}")
+        kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
+        warn(f"{images}: {_listed(names, kind)} left out: {why}")
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
     # Work in the output's parent folder, so that the last step is a rename within one file system.
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
-        photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
+        photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
         masked = _staged_masks(photos, mask_files, masks, work)
-        answer = _run_worker(sfm_task(settings, photos, masked, work, workers), work, report)
+        task = sfm_task(settings, photos, masked, videos.sequences, work, workers) | {"weights": str(weights or "")}
+        answer = run_worker(task, work, report)
+        if "refused" in answer:
+            raise InputError(answer["refused"])
         if "failure" in answer:
             raise InputError(_no_model(images, len(photos), answer["failure"]))
         _write_record(work / "result", fingerprint, photos, answer["result"])
-        _warn_of_losses(images, photos, answer["result"]["registered"], work / "result" / "images", masks)
+        _warn_of_losses(images, photos, answer["result"], work / "result" / "images", masks)
+        if told := focal_lengths.told(answer["result"].get("focal_lengths", ())):
+            warn(f"{images}: {told}")
         move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return output
+
+
+def _with_weights(settings: SfmSettings) -> tuple[SfmSettings, Path | None]:
+    """Return the settings and the file of weights. If weights cannot be fetched, the settings choose SIFT features."""
+    weights = learned_weights(settings.weights) if settings.features == "aliked" else None
+    return (settings if weights else replace(settings, features="sift", weights=None)), weights
+
+
+def _identity(weights: Path | None) -> str:
+    """Return the digest of the weights as text for the fingerprint, empty without weights."""
+    return f" {hashlib.sha256(weights.read_bytes()).hexdigest()}" if weights else ""
 
 
 def _described(masks: MaskUse | None, mask_files: dict[str, Path]) -> str:
@@ -166,9 +199,15 @@ def _described(masks: MaskUse | None, mask_files: dict[str, Path]) -> str:
 
 
 def _staged_photos(
-    images: Path, paths: list[Path], copies: dict[str, sfm_copies.Copy], target: Path, report: Progress, threads: int
+    images: Path,
+    paths: list[Path],
+    copies: dict[str, sfm_copies.Copy],
+    videos: VideoFrames,
+    target: Path,
+    report: Progress,
+    threads: int,
 ) -> list[sfm_photos.Photo]:
-    """Put the photographs under `target`. Returns the photographs that are not copies, and warns of copies.
+    """Put the photographs and the videos' frames under `target`. Returns them without copies, and warns of copies.
 
     copies: copies that were found before the photographs were decoded, by name.
     Raises InputError if too few photographs remain.
@@ -182,6 +221,8 @@ def _staged_photos(
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
         again = f"{count} and left out ({sfm_copies.listed(copies)}); to use the copies instead, give only their folder"
         warn(f"{images}: {again}")
+    photos = videos.by_video(photos)
+    photos += videos.staged(target, lambda fraction: report("reading frames", fraction), threads)
     _require_enough(images, len(photos))
     return photos
 
@@ -189,7 +230,7 @@ def _staged_photos(
 def _staged_masks(
     photos: list[sfm_photos.Photo], mask_files: dict[str, Path], masks: MaskUse | None, work: Path
 ) -> list[str]:
-    """Write the masks of the photographs under `work`. Returns the names of the photographs with a mask.
+    """Write the masks of the photographs under `work`. Returns the names in the scene of the photographs with a mask.
 
     mask_files: paths of the mask files, by photograph. A photograph's alpha may be a mask too.
     """
@@ -199,27 +240,38 @@ def _staged_masks(
     for photo in photos:
         cut = photo.transparent and masks.alpha != "blend"
         if cut or photo.name in mask_files:
-            mask_file, target = mask_files.get(photo.name), work / "masks" / f"{photo.name}.png"
-            inner = work / "photos" / photo.name if cut else None
+            mask_file, target = mask_files.get(photo.name), work / "masks" / f"{photo.scene_name}.png"
+            inner = work / "photos" / photo.scene_name if cut else None
             stage_mask(mask_file, target, (photo.width, photo.height), invert=masks.invert, photo=inner)
-            masked.append(photo.name)
+            masked.append(photo.scene_name)
     return masked
 
 
 def sfm_task(
-    settings: SfmSettings, photos: list[sfm_photos.Photo], masked: list[str], work: Path, threads: int
+    settings: SfmSettings,
+    photos: list[sfm_photos.Photo],
+    masked: list[str],
+    sequences: list[list[str]],
+    work: Path,
+    threads: int,
 ) -> dict[str, Any]:
     """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON.
 
-    masked: names of the photographs with a mask. work: folder for the photographs, masks and intermediate files.
+    masked: names of the photographs with a mask.
+    sequences: names of each video's frames, in display order.
+    work: folder for the photographs, masks and intermediate files.
     """
-    many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
+    names = {photo.scene_name for photo in photos}
     return {
         "masks": masked,
         "photos": str(work / "photos"),
         "work": str(work),
         "groups": sfm_photos.camera_groups(photos, settings.shared_camera),
-        "sequential": settings.matching == "sequential" or (settings.matching == "auto" and many),
+        "sequences": [[name for name in frames if name in names] for frames in sequences],
+        "features": settings.features,
+        "weights": "",
+        "matching": settings.matching,
+        "mapper": settings.mapper,
         "camera_model": settings.camera_model,
         "max_image_size": settings.max_image_size,
         "max_features": settings.max_features,
@@ -230,22 +282,28 @@ def sfm_task(
 
 def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo], result: dict[str, Any]) -> None:
     """Write sfm.json, the record of a reconstruction, into the folder of the result."""
-    missing = sorted({photo.name for photo in photos} - set(result["registered"]))
+    missing = sorted({photo.scene_name for photo in photos} - set(result["registered"]))
     record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
     record["files"] = _sizes(folder)
     (folder / SFM_RECORD_FILE).write_bytes((json.dumps(record, indent=2) + "\n").encode())
 
 
 def _warn_of_losses(
-    images: Path, photos: list[sfm_photos.Photo], registered: list[str], result: Path, masks: MaskUse | None
+    images: Path, photos: list[sfm_photos.Photo], answer: dict[str, Any], result: Path, masks: MaskUse | None
 ) -> None:
     """Warn of photographs without a pose, and of transparent photographs that lost their alpha.
 
-    registered: names of the photographs with a pose.
+    answer: the worker's result, with the names of the photographs with a pose, and of those in smaller models.
     result: folder of the undistorted photographs.
     masks: use of masks and alpha. If alpha was used as a mask, its loss does not matter.
     """
-    if missing := sorted({photo.name for photo in photos} - set(registered)):
+    registered, others = answer["registered"], answer["fragments"]
+    for names in others:
+        warn(
+            f"{images}: {_listed(names)} form a model of their own, with too few matches to the {len(registered):,} "
+            "photo(s) that are used; to join both, add photos in between"
+        )
+    if missing := sorted({photo.scene_name for photo in photos}.difference(registered, *others)):
         warn(f"{images}: no camera pose was found for {_listed(missing)}, which will not be used")
     lost = _without_their_alpha(photos, registered, result)
     if lost and (masks is None or masks.alpha == "blend"):
@@ -288,7 +346,7 @@ def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], 
 
     pycolmap keeps alpha only if the lens model has no distortion, because it then copies the file.
     """
-    transparent = {photo.name for photo in photos if photo.transparent}
+    transparent = {photo.scene_name for photo in photos if photo.transparent}
     return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
 
 
@@ -336,92 +394,6 @@ def _sizes(result: Path) -> dict[str, int]:
     return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
 
 
-def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
-    """Run `clsplat.scenes.sfm.worker` to its end. Returns the worker's answer, {"result"} or {"failure"}.
-
-    task: result of `sfm_task`. work: folder for the log and intermediate files.
-    Raises ClsplatError if the worker ends without an answer.
-    """
-    log_path = work / "log.txt"
-    search_path = [str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH", "")]
-    with open(log_path, "wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "clsplat.scenes.sfm.worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            encoding="utf-8",
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, search_path))},
-            **apart(),  # Ctrl-C reaches only this process, which then ends the worker
-        )
-        assert process.stdin is not None
-        assert process.stdout is not None
-        try:
-            process.stdin.write(json.dumps(task) + "\n")
-            process.stdin.flush()
-            answer = _follow(process.stdout, work / "database.db", report)
-            process.wait()
-        except OSError:  # the worker has ended: broken pipe, or invalid argument on Windows
-            answer = {}
-        finally:
-            process.kill()
-            process.wait()
-            with contextlib.suppress(OSError):  # closing sends buffered input, which an ended worker cannot read
-                process.stdin.close()
-            process.stdout.close()
-    if not answer:
-        lines = [line.strip() for line in log_path.read_text("utf-8", errors="replace").splitlines() if line.strip()]
-        raise ClsplatError(f"structure from motion failed (status {process.returncode}): {' | '.join(lines[-3:])}")
-    return answer
-
-
-def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
-    """Report the worker's progress until it answers. Returns the answer, {} if the worker ends without one."""
-    inbox: queue.Queue[str | None] = queue.Queue()
-
-    def read() -> None:
-        try:
-            for line in lines:
-                inbox.put(line)
-        except ValueError:  # the stream is closed, because the caller was interrupted
-            pass
-        inbox.put(None)
-
-    threading.Thread(target=read, daemon=True).start()
-    text, table, total = "starting", None, None
-    counted_at = time.monotonic()
-    while True:
-        try:
-            line = inbox.get(timeout=0.25)
-        except queue.Empty:
-            if table and total and time.monotonic() - counted_at > 0.5:
-                report(text, min(_rows(database, table) / total, 1.0))
-                counted_at = time.monotonic()
-            continue
-        if line is None:
-            return {}
-        message = json.loads(line)
-        if "result" in message or "failure" in message:
-            return dict(message)
-        if "stage" in message:
-            text, table = _PROGRESS_BY_STAGE[message["stage"]]
-            total, places = message["total"], message["stage"].startswith("cameras")
-            report(text, None if not total else CountedFraction(0, total, PLACED_CAMERAS_UNIT) if places else 0.0)
-        elif total:
-            report(text, CountedFraction(message["done"], total, PLACED_CAMERAS_UNIT))
-
-
-def _rows(database: Path, table: str) -> int:
-    """Return the number of rows in a table of the worker's database; 0 while the table cannot be read."""
-    try:
-        name = f"{database.resolve().as_uri()}?mode=ro"
-        with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608 - our names
-    except sqlite3.Error:
-        return 0
-
-
 def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     return (
         f"{images}: no cameras could be recovered from {count} photos: the median photo has {evidence['features']} "
@@ -430,6 +402,6 @@ def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     )
 
 
-def _listed(names: list[str]) -> str:
+def _listed(names: list[str], kind: str = "photo(s)") -> str:
     """Return text such as "3 photo(s) (a.jpg, b.jpg, c.jpg)", shortened if there are many names."""
-    return f"{len(names):,} photo(s) ({examples(names)})"
+    return f"{len(names):,} {kind} ({examples(names)})"

@@ -6,7 +6,7 @@ of the process, and a crash in native code must not end the caller.
 
 The task is one line of JSON on standard input, which then stays open. When it closes, the parent has ended, and the
 worker ends too. Answers are lines of JSON on standard output: {"stage", "total"}, {"done"} during a stage, and
-{"result"} or {"failure"} at the end.
+{"result"}, {"failure"} or {"refused"} at the end.
 """
 
 from __future__ import annotations
@@ -14,16 +14,19 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sqlite3
-import statistics
 import sys
 import threading
-from collections.abc import Sequence
-from functools import partial
+import time
 from pathlib import Path
 from typing import Any, TextIO
 
 import pycolmap
+
+from clsplat.scenes.sfm import focal_lengths
+from clsplat.scenes.sfm.pipeline import aliked, mapping, matching
+from clsplat.scenes.sfm.pipeline.database import feature_evidence, renumber_by_name
+from clsplat.scenes.sfm.pipeline.features import extract_sift
+from clsplat.scenes.sfm.worker_progress import UNDISTORTED_IMAGES
 
 MAX_SINGLE_THREAD_PHOTOS = 80
 """Number of photographs up to which matching and mapping run on one thread each, so that their results are
@@ -33,21 +36,17 @@ Mapping on several threads adds in varying order. Matching on several threads mu
 OpenBLAS of pycolmap 4.2 is built without locks, so two threads may use the same scratch memory. Then some features are
 matched wrongly, once in about 70 reconstructions on a busy machine. Verification of matches has a thread of its own.
 """
-MIN_OPENCV_PHOTOS = 20
-"""Minimum number of photographs of one camera for fitting the eight parameters of OPENCV.
-
-For a phone's distorted photographs, the reprojection error is 0.477 px with OPENCV and 0.493 px with SIMPLE_RADIAL.
-"""
-SEQUENTIAL_OVERLAP = 12
-"""Number of photographs before and after a photograph that sequential matching pairs with it. It also pairs photographs
-that are 2^n apart."""
+GLOBAL_FOLDER = "sparse-global"
+"""Folder in the worker's folder for the models of the global mapper."""
+MIN_PLACED_FRACTION = 0.6
+"""Fraction of the photographs below which mapping is repeated in another way."""
 
 
 class Worker:
     """One reconstruction from photographs. `run` calls the methods for its stages in order.
 
     task: see `sfm.reconstruct.sfm_task`. "photos" and "work" are folders. Each of "groups" lists the names of the
-        photographs of one camera.
+        photographs of one camera, each of "sequences" the frames of one video.
     channel: stream for the answers to the parent.
     """
 
@@ -56,6 +55,9 @@ class Worker:
         self.photos, self.work = Path(task["photos"]), Path(task["work"])
         self.database = self.work / "database.db"
         self.count = sum(map(len, task["groups"]))
+        self.placed = 0
+        self.seconds: dict[str, dict[str, float]] = {}
+        self._stage, self._began = "", (0.0, 0.0)
 
     @property
     def reproducible_threads(self) -> int:
@@ -66,123 +68,130 @@ class Worker:
     def say(self, **message: Any) -> None:
         print(json.dumps(message), file=self.channel, flush=True)
 
+    def begin(self, stage: str, total: int | None) -> None:
+        """Begin a stage: tell the parent, and note the wall time and processor time of the stage before."""
+        self.end()
+        self._stage, self._began = stage, _clocks()
+        self.say(stage=stage, total=total)
+
+    def end(self) -> None:
+        """Note the seconds of the stage that ends, in `seconds`."""
+        if self._stage:
+            wall, processor = (now - then for now, then in zip(_clocks(), self._began, strict=True))
+            self.seconds[self._stage] = {"wall": round(wall, 2), "processor": round(processor, 2)}
+        self._stage = ""
+
     def run(self) -> None:
         pycolmap.set_random_seed(self.task["seed"])
-        self.extract()
-        renumber_by_name(self.database)
-        self.match()
-        models = self.map(relaxed=False)
-        if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
-            # The cameras may be close together, or there may be few features: try again with lower thresholds.
-            models |= self.map(relaxed=True)
-        if not models:
-            self.say(failure=self.evidence())
+        try:
+            self.extract()
+        except aliked.WeightsError as error:
+            self.say(refused=f"{self.task['weights']}: {error}")
             return
-        best = max(models, key=lambda path: models[path].num_reg_images())  # models are not sorted by size
-        self.undistort(best)
+        given = focal_lengths.from_exif(self.database)
+        chosen, pairs = self.match()
+        models = self.map()
+        if not models:
+            self.say(failure=feature_evidence(self.database))
+            return
+        best, others = mapping.fragments(models)
         model = models[best]
-        registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+        self.begin("undistorting", model.num_reg_images())
+        self.undistort(best)
+        self.end()
         self.say(
             result={
-                "registered": registered,
+                "registered": mapping.placed_names(model),
+                "fragments": others,
                 "points": model.num_points3D(),
                 "mean_reprojection_error": model.compute_mean_reprojection_error(),
+                "features": self.task["features"],
+                "matching": chosen,
+                "pairs": pairs,
+                "mapper": "global" if best.parent.name == GLOBAL_FOLDER else "incremental",
+                "seconds": self.seconds,
                 "pycolmap": pycolmap.__version__,
+                "focal_lengths": focal_lengths.compared(model, given),
             }
         )
 
     def extract(self) -> None:
-        """Extract SIFT features of every photograph into the database, with one camera for each group."""
-        self.say(stage="features", total=self.count)
-        options = pycolmap.FeatureExtractionOptions()
-        options.use_gpu = False
-        options.num_threads = self.task["threads"]
-        options.max_image_size = self.task["max_image_size"]
-        options.sift.max_num_features = self.task["max_features"]
-        singles = [names[0] for names in self.task["groups"] if len(names) == 1]
-        batches = [(names, pycolmap.CameraMode.SINGLE) for names in self.task["groups"] if len(names) > 1]
-        if singles:  # in one call, as only the photographs of one call are processed in parallel
-            batches.append((singles, pycolmap.CameraMode.PER_IMAGE))
-        for names, mode in batches:
-            model = self.task["camera_model"]
-            if model == "auto":
-                shared = mode == pycolmap.CameraMode.SINGLE and len(names) >= MIN_OPENCV_PHOTOS
-                model = "OPENCV" if shared else "SIMPLE_RADIAL"
-            reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = model
-            if self.task["masks"]:
-                reader.mask_path = self.work / "masks"
-            pycolmap.extract_features(
-                database_path=self.database,
-                image_path=self.photos,
-                image_names=names,
-                camera_mode=mode,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
-
-    def match(self) -> None:
-        """Match features of all pairs, or of neighbours in the order of names, and verify them by epipolar geometry."""
-        options = pycolmap.FeatureMatchingOptions()
-        options.use_gpu = False
-        options.num_threads = self.reproducible_threads
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = self.task["seed"]
-        if self.task["sequential"]:
-            self.say(stage="matches", total=None)
-            pairing = pycolmap.SequentialPairingOptions()
-            pairing.overlap = SEQUENTIAL_OVERLAP
-            match = partial(pycolmap.match_sequential, pairing_options=pairing)
+        """Extract the features of every photograph into the database, with one camera for each group."""
+        if self.task["features"] == "aliked":
+            network = aliked.AlikedNetwork(Path(self.task["weights"]))
+            self.begin("learned features", self.count)
+            aliked.extract_aliked(self.database, self.task, network, lambda done: self.say(done=done))
         else:
-            self.say(stage="matches", total=self.count * (self.count - 1) // 2)
-            match = pycolmap.match_exhaustive
-        match(
-            database_path=self.database,
-            matching_options=options,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
+            self.begin("features", self.count)
+            extract_sift(self.database, self.task)
+        renumber_by_name(self.database)
 
-    def map(self, *, relaxed: bool) -> dict[Path, pycolmap.Reconstruction]:
-        """Recover camera poses and points by incremental mapping. Returns all models, by their folders.
+    def match(self) -> tuple[str, int]:
+        """Match and verify the features of the chosen pairs. Returns the matching and its number of pairs."""
+        seed, threads = self.task["seed"], self.reproducible_threads
+        self.begin("pairs", None)
+        chosen, pairs = matching.matched_pairs(self.database, self.task["matching"], self.task["sequences"], seed)
+        if self.task["features"] == "aliked":
+            self.begin("learned matches", len(pairs))
+            aliked.match_aliked(self.database, pairs, threads=threads, seed=seed, done=lambda done: self.say(done=done))
+        else:
+            self.begin("matches", len(pairs))
+            matching.match_features(self.database, pairs, threads=threads, seed=seed)
+        return chosen, len(pairs)
 
-        relaxed: accept smaller triangulation angles and fewer matches than by default.
+    def map(self) -> mapping.Models:
+        """Recover camera poses and points. Returns all models.
+
+        "auto" adds one photograph after another. If few are placed, as after a bad first pair, it solves for
+        all at once. If that places few, too, the cameras may be close together, or there may be few features, and
+        photographs are added with lower thresholds.
         """
-        self.say(stage="cameras again" if relaxed else "cameras", total=self.count)
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = self.reproducible_threads
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.task["seed"]
-        options.min_model_size = 3
-        if relaxed:
-            options.mapper.init_min_tri_angle = 4.0
-            options.mapper.init_max_forward_motion = 1.0
-            options.mapper.init_min_num_inliers = 50
-            options.mapper.abs_pose_min_num_inliers = 15
-            options.mapper.filter_min_tri_angle = 0.8
-            options.triangulation.min_angle = 1.0
-        output = self.work / ("sparse-relaxed" if relaxed else "sparse")
-        output.mkdir()
-        placed = 2
+        choice = self.task["mapper"]
+        models = {} if choice == "global" else self.add_one_by_one(relaxed=False)
+        if choice == "global" or (choice == "auto" and self.places_few(models)):
+            models |= self.solve_at_once()
+        if choice != "global" and self.places_few(models):
+            models |= self.add_one_by_one(relaxed=True)
+        return models
 
-        def count_one() -> None:
-            nonlocal placed
-            placed += 1
-            self.say(done=min(placed, self.count))
+    def places_few(self, models: mapping.Models) -> bool:
+        """Return True if the largest model has less than MIN_PLACED_FRACTION of the photographs."""
+        most = max((model.num_reg_images() for model in models.values()), default=0)
+        return most < MIN_PLACED_FRACTION * self.count
 
-        models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
-            database_path=self.database,
-            image_path=self.photos,
-            output_path=output,
-            options=options,
-            next_image_callback=count_one,
+    def solve_at_once(self) -> mapping.Models:
+        """Recover models by global mapping."""
+        self.begin("cameras at once", None)
+        return mapping.global_models(
+            self.database,
+            self.photos,
+            self.work / GLOBAL_FOLDER,
+            threads=self.reproducible_threads,
+            seed=self.task["seed"],
         )
-        return {output / str(index): model for index, model in models.items()}
+
+    def add_one_by_one(self, *, relaxed: bool) -> mapping.Models:
+        """Recover models by incremental mapping. relaxed: as in `mapping.incremental_models`."""
+        self.begin("cameras again" if relaxed else "cameras", self.count)
+        self.placed = 2
+        return mapping.incremental_models(
+            self.database,
+            self.photos,
+            self.work / ("sparse-relaxed" if relaxed else "sparse"),
+            threads=self.reproducible_threads,
+            seed=self.task["seed"],
+            relaxed=relaxed,
+            placed=self.count_one,
+        )
+
+    def count_one(self) -> None:
+        """Tell the parent that one more camera is placed."""
+        self.placed += 1
+        self.say(done=min(self.placed, self.count))
 
     def undistort(self, model: Path) -> None:
         """Resample the registered photographs to pinhole cameras, in the layout that COLMAP's readers expect."""
-        self.say(stage="undistorting", total=None)
-        flat, result = self.work / "undistorted", self.work / "result"
+        flat, result = self.work / Path(UNDISTORTED_IMAGES).parent, self.work / "result"
         pycolmap.undistort_images(
             output_path=flat,
             input_path=model,
@@ -211,17 +220,10 @@ class Worker:
             path.parent.mkdir(parents=True, exist_ok=True)
             flat.write(path)
 
-    def evidence(self) -> dict[str, Any]:
-        """Return counts of features and matches, for the message about a failed reconstruction."""
-        with sqlite3.connect(self.database) as connection:
-            features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
-            matches = [row[0] for row in connection.execute("SELECT rows FROM two_view_geometries")]
-        return {
-            "features": int(statistics.median(features)) if features else 0,
-            "pairs": len(matches),
-            "matched": sum(rows > 0 for rows in matches),
-            "matches": max(matches, default=0),
-        }
+
+def _clocks() -> tuple[float, float]:
+    """Return the wall time and the processor time of this process in seconds."""
+    return time.monotonic(), time.process_time()
 
 
 def as_pinhole(folder: Path) -> None:
@@ -234,50 +236,6 @@ def as_pinhole(folder: Path) -> None:
         camera.params = [focal, focal, cx, cy]
     if simple:
         model.write(folder)
-
-
-def renumber_by_name(database: Path) -> None:
-    """Renumber the database's images, frames, cameras and rigs in the order of the images' names.
-
-    Several threads process photographs and number them as they finish, in varying order. The numbers decide the order
-    of all later work, and thus the last bits of the result.
-    """
-    connection = sqlite3.connect(database)
-    with connection:
-        rows = connection.execute(
-            "SELECT i.image_id, d.frame_id, i.camera_id, f.rig_id FROM images i "
-            "JOIN frame_data d ON d.data_id = i.image_id JOIN frames f ON f.frame_id = d.frame_id ORDER BY i.name"
-        ).fetchall()
-        images, frames, cameras, rigs = (_ranks([row[column] for row in rows]) for column in range(4))
-        for table, column, ranks in (
-            ("images", "image_id", images),
-            ("keypoints", "image_id", images),
-            ("descriptors", "image_id", images),
-            ("frame_data", "data_id", images),
-            ("pose_priors", "corr_data_id", images),
-            ("frames", "frame_id", frames),
-            ("frame_data", "frame_id", frames),
-            ("cameras", "camera_id", cameras),
-            ("images", "camera_id", cameras),
-            ("rigs", "ref_sensor_id", cameras),
-            ("frame_data", "sensor_id", cameras),
-            ("pose_priors", "corr_sensor_id", cameras),
-            ("rigs", "rig_id", rigs),
-            ("frames", "rig_id", rigs),
-        ):
-            # Renumber in two steps, by way of unused numbers, as the values of these columns must be unique.
-            far = 1 << 30
-            connection.executemany(
-                f"UPDATE {table} SET {column} = ? WHERE {column} = ?",  # noqa: S608 - names from the list above
-                [(new + far, old) for old, new in ranks.items()],
-            )
-            connection.execute(f"UPDATE {table} SET {column} = {column} - {far} WHERE {column} >= {far}")  # noqa: S608
-    connection.close()
-
-
-def _ranks(numbers: Sequence[int]) -> dict[int, int]:
-    """Return the rank of each number, from 1, in the order of first occurrence."""
-    return {number: place for place, number in enumerate(dict.fromkeys(numbers), start=1)}
 
 
 def _end_with_parent(stream: TextIO) -> None:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from clsplat.errors import WriteError, reason_of
 from clsplat.files.atomic import TEMPORARY_NAME, atomic_name, is_abandoned, remove
 from clsplat.files.mounts import NetworkRate
+from clsplat.images.decoders.photo_decoders import decoder_versions
 from clsplat.version import package_version
 
 FORMAT_VERSION = 1
@@ -40,8 +41,8 @@ _HEADER_BYTES = _HEADER.size + _CHECKSUM.size
 
 
 def key_of(parts: Sequence[object]) -> bytes:
-    """Key of decoded pixels: digest of `parts`, and of the versions of this package, the format and the decoder."""
-    versions = [FORMAT_VERSION, package_version(), oiio.VERSION_STRING]
+    """Key of decoded pixels: digest of `parts`, and of the versions of this package, the format and the decoders."""
+    versions = [FORMAT_VERSION, package_version(), oiio.VERSION_STRING, *decoder_versions()]
     text = json.dumps([versions, *parts], default=repr)
     return hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=KEY_BYTES).digest()
 

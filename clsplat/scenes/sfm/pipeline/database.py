@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""COLMAP's database of a reconstruction: numbers in the order of names, features, GPS positions, counts."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+GPS_ALTITUDE_M = 0.0
+"""Altitude in metres at which horizontal positions are computed. EXIF's altitudes are often wrong by 100 m."""
+
+
+def renumber_by_name(database: Path) -> None:
+    """Renumber the database's images, frames, cameras and rigs in the order of the images' names.
+
+    Several threads process photographs and number them as they finish, in varying order. The numbers decide the order
+    of all later work, and thus the last bits of the result.
+    """
+    connection = sqlite3.connect(database)
+    with connection:
+        rows = connection.execute(
+            "SELECT i.image_id, d.frame_id, i.camera_id, f.rig_id FROM images i "
+            "JOIN frame_data d ON d.data_id = i.image_id JOIN frames f ON f.frame_id = d.frame_id ORDER BY i.name"
+        ).fetchall()
+        images, frames, cameras, rigs = (_ranks([row[column] for row in rows]) for column in range(4))
+        for table, column, ranks in (
+            ("images", "image_id", images),
+            ("keypoints", "image_id", images),
+            ("descriptors", "image_id", images),
+            ("frame_data", "data_id", images),
+            ("pose_priors", "corr_data_id", images),
+            ("frames", "frame_id", frames),
+            ("frame_data", "frame_id", frames),
+            ("cameras", "camera_id", cameras),
+            ("images", "camera_id", cameras),
+            ("rigs", "ref_sensor_id", cameras),
+            ("frame_data", "sensor_id", cameras),
+            ("pose_priors", "corr_sensor_id", cameras),
+            ("rigs", "rig_id", rigs),
+            ("frames", "rig_id", rigs),
+        ):
+            # Renumber in two steps, by way of unused numbers, as the values of these columns must be unique.
+            far = 1 << 30
+            connection.executemany(
+                f"UPDATE {table} SET {column} = ? WHERE {column} = ?",  # noqa: S608 - names from the list above
+                [(new + far, old) for old, new in ranks.items()],
+            )
+            connection.execute(f"UPDATE {table} SET {column} = {column} - {far} WHERE {column} >= {far}")  # noqa: S608
+    connection.close()
+
+
+def image_names(database: Path) -> dict[int, str]:
+    """Return the names of the photographs, keyed and ordered by their numbers."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        return dict(connection.execute("SELECT image_id, name FROM images ORDER BY image_id").fetchall())
+
+
+def rename_images(database: Path, names: dict[int, str]) -> None:
+    """Give the photographs other names, keyed by their numbers."""
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        # A name may be the present name of another photograph, and names must be unique.
+        connection.execute("UPDATE images SET name = '/' || image_id")
+        connection.executemany(
+            "UPDATE images SET name = ? WHERE image_id = ?", [(new, at) for at, new in names.items()]
+        )
+
+
+def largest_descriptors(database: Path, ids: Sequence[int], most: int) -> list[NDArray[Any]]:
+    """Return the descriptors (features, dimensions) of the largest features of each photograph.
+
+    ids: numbers of the photographs. most: maximum number of features in a photograph.
+    """
+    found = []
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        for image in ids:
+            points = _array(connection, "keypoints", image, np.dtype(np.float32))
+            learned = _cell(connection, "SELECT type FROM descriptors WHERE image_id = ?", image) not in (None, 0)
+            rows = _array(connection, "descriptors", image, np.dtype(np.float32 if learned else np.uint8))
+            # A keypoint has x, y and the affine shape (4 values), or x, y, scale and orientation, or x and y.
+            sizes = np.abs(points[:, 2]) if points.shape[1] > 2 else np.zeros(len(points))
+            if points.shape[1] == 6:
+                sizes = np.hypot(points[:, 2], points[:, 4])
+            found.append(rows[np.argsort(-sizes, kind="stable")[:most]])
+    return found
+
+
+def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
+    """Return the photographs' GPS positions (N, 2) in metres to the east and north of the first; NaN if unknown.
+
+    ids: numbers of the photographs.
+    """
+    place = {image: at for at, image in enumerate(ids)}
+    degrees = np.full((len(ids), 3), np.nan)
+    with pycolmap.Database.open(database) as opened:
+        for prior in opened.read_all_pose_priors():
+            if prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84:
+                degrees[place[prior.corr_data_id.id]] = (*prior.position[:2], GPS_ALTITUDE_M)
+    known = np.flatnonzero(np.isfinite(degrees).all(axis=1))
+    metres = np.full((len(ids), 2), np.nan)
+    if len(known):
+        metres[known] = pycolmap.GPSTransform().ellipsoid_to_enu(degrees[known], *degrees[known[0]])[:, :2]
+    return metres
+
+
+def feature_evidence(database: Path) -> dict[str, Any]:
+    """Return counts of features and matches, for the message about a failed reconstruction."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
+        matches = [row[0] for row in connection.execute("SELECT rows FROM two_view_geometries")]
+    return {
+        "features": int(statistics.median(features)) if features else 0,
+        "pairs": len(matches),
+        "matched": sum(rows > 0 for rows in matches),
+        "matches": max(matches, default=0),
+    }
+
+
+def _cell(connection: sqlite3.Connection, query: str, image: int) -> Any:
+    row = connection.execute(query, (image,)).fetchone()
+    return row[0] if row else None
+
+
+def _array(connection: sqlite3.Connection, table: str, image: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the array of a photograph in a table of the database, (0, 2) if there is none."""
+    row = connection.execute(f"SELECT rows, data FROM {table} WHERE image_id = ?", (image,)).fetchone()  # noqa: S608
+    if row is None or not row[0]:
+        return np.zeros((0, 2), dtype)
+    return np.frombuffer(row[1], dtype).reshape(row[0], -1)
+
+
+def _ranks(numbers: Sequence[int]) -> dict[int, int]:
+    """Return the rank of each number, from 1, in the order of first occurrence."""
+    return {number: place for place, number in enumerate(dict.fromkeys(numbers), start=1)}

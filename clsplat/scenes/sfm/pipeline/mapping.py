@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recovery of camera poses and points from verified matches, with pycolmap's incremental or global mapper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+MIN_MODEL_PHOTOS = 3
+"""Minimum number of photographs in a model."""
+GLOBAL_ADJUSTMENT_GROWTH = 1.3
+"""Growth of a model, in photographs or points, after which all its poses and points are adjusted again. pycolmap's
+default is 1.1."""
+GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS = 2, 1
+"""Maximum numbers of rounds of an adjustment of the whole model, and of the neighbours of a new photograph. Each round
+drops outliers. pycolmap's defaults are 5 and 2."""
+
+Models = dict[Path, pycolmap.Reconstruction]
+"""Models by their folders. Photographs that share too few matches with the others are in a model of their own."""
+
+
+def incremental_models(
+    database: Path, photos: Path, output: Path, *, threads: int, seed: int, relaxed: bool, placed: Callable[[], None]
+) -> Models:
+    """Recover models by adding one photograph after another.
+
+    photos: folder of the photographs. output: folder for the models, which is made.
+    relaxed: accept smaller triangulation angles and fewer matches than by default.
+    placed: function that is called after each photograph that is added to the first two.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_model_size = MIN_MODEL_PHOTOS
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_GROWTH
+    options.ba_global_max_refinements, options.ba_local_max_refinements = GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS
+    if relaxed:
+        options.mapper.init_min_tri_angle = 4.0
+        options.mapper.init_max_forward_motion = 1.0
+        options.mapper.init_min_num_inliers = 50
+        options.mapper.abs_pose_min_num_inliers = 15
+        options.mapper.filter_min_tri_angle = 0.8
+        options.triangulation.min_angle = 1.0
+    output.mkdir()
+    models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+        database_path=database,
+        image_path=photos,
+        output_path=output,
+        options=options,
+        next_image_callback=placed,
+    )
+    return {output / str(index): model for index, model in models.items()}
+
+
+def global_models(database: Path, photos: Path, output: Path, *, threads: int, seed: int) -> Models:
+    """Recover models by averaging the rotations of all pairs, then solving for all positions and points at once.
+
+    The focal lengths of photographs without EXIF are first estimated from the pairs, since pairs need them here.
+    """
+    output.mkdir()
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = seed
+    pycolmap.calibrate_view_graph(database_path=database, options=calibration)
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = seed
+    options.mapper.rotation_averaging.random_seed = options.mapper.global_positioning.random_seed = seed
+    options.mapper.retriangulation.random_seed = seed
+    options.min_model_size = MIN_MODEL_PHOTOS
+    models: dict[int, pycolmap.Reconstruction] = pycolmap.global_mapping(
+        database_path=database, image_path=photos, output_path=output, options=options
+    )
+    return {output / str(index): model for index, model in models.items()}
+
+
+def fragments(models: Models) -> tuple[Path, list[list[str]]]:
+    """Return the folder of the model with the most photographs, and the photographs that only other models have.
+
+    The photographs of each other model are listed by name, the longest list first. Models that add none are left out.
+    """
+    best = max(models, key=lambda path: models[path].num_reg_images())  # models are not sorted by size
+    used, others = set(placed_names(models[best])), []
+    for path in sorted(models, key=lambda path: -models[path].num_reg_images()):
+        more = sorted(set(placed_names(models[path])) - used)
+        used.update(more)
+        if more:
+            others.append(more)
+    return best, sorted(others, key=len, reverse=True)
+
+
+def placed_names(model: pycolmap.Reconstruction) -> list[str]:
+    """Return the names of the photographs that have a pose, sorted."""
+    return sorted(model.images[image].name for image in model.reg_image_ids())

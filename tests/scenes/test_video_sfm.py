@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos in place of photographs, and beside them, in structure from motion and in scenes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calls import Capture, refuses, warnings_of
+from needs import require
+from pictures import write_pixels
+from walk_videos import Walk, walk, write_walk
+
+from clsplat.cli.main import main
+from clsplat.scenes.folder_layouts import detect
+from clsplat.scenes.sfm import reconstruct as sfm
+from clsplat.scenes.sfm.video_frames import find_videos, frames_folder, reconstruction_folder
+from clsplat.scenes.video.frames import frame_sequences, take_frames
+
+require("av")
+
+WIDTH, HEIGHT, COUNT = 96, 72, 24
+
+
+@pytest.fixture(scope="module")
+def made() -> Walk:
+    return walk(WIDTH, HEIGHT, COUNT, sub_frames=1)
+
+
+@pytest.fixture(scope="module")
+def video(made: Walk, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_walk(tmp_path_factory.mktemp("videos") / "walk.mp4", made.frames)
+
+
+@pytest.fixture
+def tasks(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Tasks that the worker would have been given; every photograph gets a pose."""
+    given: list[dict[str, Any]] = []
+
+    def run(task: dict[str, Any], work: Path, _: object) -> dict[str, Any]:
+        given.append(task)
+        names = sorted(name for group in task["groups"] for name in group)
+        for name in names:
+            assert (Path(task["photos"]) / name).is_file()
+        shutil.copytree(task["photos"], work / "result" / "images")
+        (work / "result" / "sparse" / "0").mkdir(parents=True)
+        (work / "result" / "sparse" / "0" / "images.bin").write_bytes(b"")
+        return {"result": {"registered": names}}
+
+    monkeypatch.setattr(sfm, "_run_worker", run)
+    return given
+
+
+def names_of(task: dict[str, Any]) -> list[str]:
+    return sorted(name for group in task["groups"] for name in group)
+
+
+def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    heard: list[str] = []
+    sfm.reconstruct(video, tmp_path / "scene", frames=6, progress=lambda text, _: heard.append(text))
+    (task,) = tasks
+    assert task["groups"] == task["sequences"] and len(task["groups"]) == 1
+    assert all(name.startswith("walk.mp4/") for name in names_of(task)) and 4 <= len(names_of(task)) <= 6
+    told = [text for text in heard if " frames chosen" in text and "from 0:02 of 96x72 SDR" in text]
+    assert len(told) == 1 and told[0].startswith(f"walk.mp4: {len(names_of(task))} of {COUNT} frames")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene", "scene_frames"]
+    assert json.loads((tmp_path / "scene/sfm.json").read_text())["photos"] == len(names_of(task))
+
+    # the same again, also after the frames were removed: they have the same table
+    sfm.reconstruct(video, tmp_path / "scene", frames=6)
+    shutil.rmtree(tmp_path / "scene_frames")
+    sfm.reconstruct(video, tmp_path / "scene", frames=6)
+    assert len(tasks) == 1
+    refuses("scene_frames: has the frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
+    sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
+    assert len(tasks) == 2
+
+
+def test_videos_and_photographs_in_one_folder_are_several_cameras(
+    video: Path, made: Walk, tmp_path: Path, tasks: list[dict[str, Any]]
+) -> None:
+    folder = tmp_path / "shot"
+    (folder / "more").mkdir(parents=True)
+    shutil.copy(video, folder / "walk.mp4")
+    shutil.copy(video, folder / "more" / "Walk.MOV")
+    for index in (10, 14, 18):
+        write_pixels(folder / f"{index}.png", np.rint(255 * made.frames[index]).astype(np.uint8))
+    (folder / "live.mov").write_bytes(b"a moving photograph")
+    shutil.copy(folder / "10.png", folder / "LIVE.png")
+    (folder / "live.mov").rename(folder / "LIVE.mov")
+    messages = warnings_of(lambda: sfm.reconstruct(folder, folder / "scene", frames=4))
+    (task,) = tasks
+    assert {name.split("/")[0] for name in names_of(task)} >= {"10.png", "walk.mp4", "more"}
+    groups = [{name.rpartition("/")[0] for name in group} for group in task["groups"]]
+    assert sorted(map(sorted, groups)) == [[""], ["more/Walk.MOV"], ["walk.mp4"]]
+    assert [len(names) for names in task["sequences"]] == [4, 4]
+    assert any("1 video(s) (LIVE.mov) left out: a photograph has the same name" in text for text in messages)
+    # the output is inside the folder: neither its frames nor its photographs are found next time
+    sfm.reconstruct(folder, folder / "scene", frames=4)
+    assert len(tasks) == 1
+
+
+def test_a_folder_of_frames_keeps_their_order(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    taken = take_frames([video], tmp_path / "frames", count=6)
+    (tmp_path / "frames" / taken.names[1]).unlink()
+    sfm.reconstruct(tmp_path / "frames", tmp_path / "scene")
+    assert tasks[0]["sequences"] == [[name for name in taken.names if name != taken.names[1]]]
+    assert not (tmp_path / "scene_frames").exists()
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"frames": []}', '{"videos": [{"video": "a", "frames": [{"name": 3}]}]}'])
+def test_a_table_of_another_program_is_ignored(text: str, tmp_path: Path) -> None:
+    (tmp_path / "frames.json").write_text(text)
+    assert frame_sequences(tmp_path) == []
+
+
+def test_photographs_alone_have_no_sequences(made: Walk, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    for index in (10, 14, 18):
+        write_pixels(tmp_path / "in" / f"{index}.png", np.rint(255 * made.frames[index]).astype(np.uint8))
+    sfm.reconstruct(tmp_path / "in", tmp_path / "scene")
+    assert tasks[0]["sequences"] == []
+    refuses("--frames 5: .*in has no videos", sfm.reconstruct, tmp_path / "in", tmp_path / "other", frames=5)
+
+
+@pytest.mark.parametrize(
+    ("given", "reconstruction", "frames"),
+    [
+        ("a/walk.mp4", "a/walk_colmap", "a/walk_frames"),
+        ("a/photos", "a/photos_colmap", "a/photos_frames"),
+        ("a/my.photos", "a/my.photos_colmap", "a/my.photos_frames"),
+    ],
+)
+def test_names_of_folders(given: str, reconstruction: str, frames: str) -> None:
+    assert reconstruction_folder(Path(given)) == Path(reconstruction)
+    assert frames_folder(reconstruction_folder(Path(given))) == Path(frames)
+    assert frames_folder(Path("b/scene")) == Path("b/scene_frames")
+
+
+def test_layout_of_a_video_and_of_a_folder_of_videos(video: Path, tmp_path: Path) -> None:
+    assert detect(video) == "photos"
+    shutil.copy(video, tmp_path / "a.MP4")
+    assert detect(tmp_path) == "photos"
+    assert find_videos(tmp_path) == ([tmp_path / "a.MP4"], {})
+    (tmp_path / "a.txt").write_text("no video")
+    refuses(r"a\.txt: is a file, expected a scene's folder, a transforms\.json or a video", detect, tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda path: None, "no such folder or video, expected one with photos"),
+        (lambda path: path.write_text("hello" * 50), "cannot be read as a video"),
+    ],
+)
+def test_the_command_line_refuses_what_is_no_video(
+    make: Callable[[Path], object], told: str, tmp_path: Path, capsys: Capture
+) -> None:
+    make(tmp_path / "walk.mp4")
+    assert main(["sfm", str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "scene")]) == 2
+    said = capsys.readouterr().err
+    assert told in said and "walk.mp4" in said and "Traceback" not in said
+    (tmp_path / "a.txt").write_text("hello")
+    assert main(["sfm", str(tmp_path / "a.txt"), "-o", str(tmp_path / "scene")]) == 2
+    assert "a.txt: is a file, expected a folder with photos, or a video (.mp4" in capsys.readouterr().err
+    assert main(["sfm", str(tmp_path), "-o", str(tmp_path / "scene"), "--frames", "0"]) == 2
+    assert "--frames 0: expected at least 1" in capsys.readouterr().err
+    assert main(["train", str(tmp_path / "a.txt"), "-o", str(tmp_path / "run")]) == 2
+
+
+@pytest.mark.slow
+def test_cameras_of_a_video(tmp_path: Path) -> None:
+    video = write_walk(tmp_path / "walk.mp4", walk(320, 240, 40, sub_frames=1).frames)
+    scene = sfm.reconstruct(video, tmp_path / "scene", sfm.SfmSettings(camera_model="SIMPLE_PINHOLE"))
+    record = json.loads((scene / sfm.SFM_RECORD_FILE).read_text())
+    assert record["photos"] >= 10
+    assert len(record["registered"]) >= 0.8 * record["photos"]
