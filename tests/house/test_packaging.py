@@ -108,6 +108,20 @@ def test_the_hosted_workflow_runs_what_the_package_says_it_supports() -> None:
     assert names == {"OpenCL driver on macOS", "OpenCL driver on Windows"}
 
 
+def test_the_hosted_site_is_published_by_its_owner_alone() -> None:
+    yaml = pytest.importorskip("yaml", reason="the extra `test` brings it")
+    workflow = yaml.safe_load((ROOT / ".github/workflows/site.yml").read_text("utf-8"))
+    build, publish = workflow["jobs"]["build"], workflow["jobs"]["publish"]
+    assert workflow["permissions"] == {"contents": "read"} and "permissions" not in build
+    assert publish["permissions"] == {"pages": "write", "id-token": "write"}
+    assert publish["if"].startswith("vars.PUBLISH_SITE == 'yes' && ") and publish["needs"] == "build"
+    uses = [step["uses"] for job in (build, publish) for step in job["steps"] if "uses" in step]
+    assert [name for name in uses if "pages" in name] == ["actions/upload-pages-artifact@v4", "actions/deploy-pages@v4"]
+    (upload,) = (step for step in build["steps"] if "pages" in step.get("uses", ""))
+    commands = [step["run"] for step in build["steps"] if "run" in step]
+    assert commands[-1] == f".venv/bin/python tools/ci/site_versions.py {upload['with']['path']}"
+
+
 def test_hosted_linters_and_those_of_a_commit_are_those_of_ci() -> None:
     yaml = pytest.importorskip("yaml", reason="the extra `test` brings it")
     (job,) = yaml.safe_load((ROOT / ".github/workflows/lint.yml").read_text("utf-8"))["jobs"].values()

@@ -70,6 +70,7 @@ NEEDS = {
     "jax": of_extra("jax", "JAX", "jax"),
     "laspy": of_extra("laspy", "laspy", "las"),
     "matplotlib": of_extra("matplotlib", "Matplotlib", "plot"),
+    "mike": of_extra("mike", "mike", "docs"),
     "mkdocs": of_extra("mkdocs", "MkDocs", "docs"),
     "node": Need(
         "readers from npm", "apt-get install nodejs npm && python3 tests/support/node.py", lambda: bool(node_modules())

@@ -4,8 +4,9 @@
 
     .venv/bin/python tools/ci/site.py [FOLDER]
 
-Writes HTML to FOLDER (build/site): open its index.html. The exit status is 1 if there are warnings, for example
-of a broken link or a missing docstring. docs/mkdocs.yml has the settings.
+Writes HTML to FOLDER (build/site): open its index.html. Nothing in it, the search included, needs a server or another
+host. The exit status is 1 if there are warnings, for example of a broken link or a missing docstring. docs/mkdocs.yml
+has the settings. With the variable MIKE_DOCS_VERSION pages show the list of versions of site_versions.py.
 
 mkdocs reads only one folder, so the pages are copied to a temporary one, with the same links between them. Three things
 are added to the copy: a list of the decisions, the text of each example below the link to it, and formulas as MathML.
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import html
 import logging
+import os
 import re
 import shutil
 import sys
@@ -28,9 +30,11 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import MkDocsException
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = ("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE", ".github")
-"""Files that are copied beside docs/, as pages link to them."""
+PAGES = ("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE")
+"""Files that are copied beside docs/, as pages link to them; .github is too, as `github`."""
 DECISIONS = "docs/decisions"
+HIDDEN = re.compile(r"(?<=\]\()((?:\.\./)*)\.github/")
+"""Pattern of a link to .github. Artefacts of GitHub Pages leave out a folder of this name."""
 EXAMPLE = re.compile(r"^\[[^]]+\]\((examples/\w+\.py)\)$", re.MULTILINE)
 """Pattern of a link to an example on a line of its own."""
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
@@ -40,14 +44,15 @@ TAG = re.compile(r"\\tag\{(\w+)\}")
 def copy_pages(folder: Path) -> list[str]:
     """Copy the pages to the folder. Returns the pages of the decisions, in order."""
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / ".github", folder / "github")
     for name in PAGES:
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
-        copy(ROOT / name, folder / name)
+        shutil.copyfile(ROOT / name, folder / name)
     decisions = sorted((folder / DECISIONS).glob("*.md"))
     lines = [f"- [{path.read_text('utf-8').partition(chr(10))[0].lstrip('# ')}]({path.name})" for path in decisions]
     (folder / DECISIONS / "README.md").write_text("\n".join(["# Decisions", "", *lines, ""]), "utf-8")
     for path in folder.rglob("*.md"):
         text = path.read_text("utf-8").replace("decisions/)", "decisions/README.md)")
+        text = HIDDEN.sub(r"\1github/", text)
         path.write_text(EXAMPLE.sub(lambda link: with_code(link, folder / "docs"), text), "utf-8")
     return [f"{DECISIONS}/README.md", *(f"{DECISIONS}/{path.name}" for path in decisions)]
 
@@ -82,6 +87,8 @@ def main() -> int:
         assert config.nav is not None
         next(part for part in config.nav if "Decisions" in part)["Decisions"] = decisions
         config.plugins.events["page_content"].append(formulas)
+        if "MIKE_DOCS_VERSION" in os.environ:  # by site_versions.py, as mike sets it; alone the site has no such list
+            config.extra["version"] = {"provider": "mike"}
         try:
             build(config)
         except MkDocsException as error:
