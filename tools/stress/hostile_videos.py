@@ -6,18 +6,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-from scipy import ndimage
-from walk_videos import write_walk
+from walk_videos import sliding, write_walk
 
 from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, take_frames
 
 
 def make_video(folder: Path) -> None:
     """Write a video whose textured picture moves."""
-    noise = ndimage.gaussian_filter(np.random.default_rng(0).uniform(0, 1, (48, 120, 3)), (1.5, 1.5, 0))
-    picture = np.asarray((noise - noise.min()) / (noise.max() - noise.min()), np.float32)
-    write_walk(folder / "walk.mp4", [picture[:, 4 * index :][:, :64] for index in range(12)])
+    write_walk(folder / "walk.mp4", sliding(12))
 
 
 def read_video(folder: Path) -> None:
