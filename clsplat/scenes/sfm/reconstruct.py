@@ -241,12 +241,13 @@ def sfm_task(
     work: folder for the photographs, masks and intermediate files.
     """
     many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
+    names = {photo.name for photo in photos}
     return {
         "masks": masked,
         "photos": str(work / "photos"),
         "work": str(work),
         "groups": sfm_photos.camera_groups(photos, settings.shared_camera),
-        "sequences": sequences,
+        "sequences": [[name for name in frames if name in names] for frames in sequences],
         "sequential": settings.matching == "sequential" or (settings.matching == "auto" and many),
         "camera_model": settings.camera_model,
         "max_image_size": settings.max_image_size,

@@ -47,7 +47,6 @@ class Choice:
     blurred: (F,), True for frames that are blurred against their neighbours.
     travelled: motion of the usable frames in longer sides.
     wanted: number of frames that was asked for, or that follows from length and motion.
-    alike: number of frames that were left out because others show the same.
     """
 
     frames: NDArray[np.int64]
@@ -56,7 +55,6 @@ class Choice:
     blurred: NDArray[np.bool_]
     travelled: float
     wanted: int
-    alike: int
 
 
 def choose(measured: Measurements, count: int | None = None) -> Choice:
@@ -82,10 +80,8 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
         inside = np.flatnonzero(stretches == number)
         if (best := _sharpest(measured.sharpness, path, inside, usable)) is not None:
             chosen.append(best)
-    kept = unlike(chosen, measured)
-    return Choice(
-        np.array(kept, np.int64), stretches, fast, blurred, total, wanted, len(chosen) - len(kept)
-    )  # fmt: skip
+    kept = np.array(unlike(chosen, measured), np.int64)
+    return Choice(kept, stretches, fast, blurred, total, wanted)
 
 
 def default_count(total: float, seconds: float, frames: int) -> int:

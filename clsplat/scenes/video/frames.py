@@ -123,11 +123,13 @@ def take_frames(
 def frame_sequences(folder: Path) -> list[list[str]]:
     """Return the frames' names in display order, a list for each video, by the table of a folder of frames.
 
-    The result is empty for a folder without a table. Frames that no longer exist are left out.
+    The result is empty for a folder without a table, or if the file of that name is another program's. Frames that no
+    longer exist are left out.
     """
-    if not is_file(folder / FRAME_TABLE_FILE):
+    try:
+        taken = _from_table(folder, _table(folder))
+    except InputError:
         return []
-    taken = _from_table(folder, _table(folder))
     present = [[name for name in video.names if is_file(folder / name)] for video in taken.videos]
     return [names for names in present if names]
 

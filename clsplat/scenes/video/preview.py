@@ -41,8 +41,10 @@ def preview(facts: VideoFacts, measured: Measurements, choice: Choice) -> Previe
     rate = rates(measured)[~choice.fast]
     speed = float(np.median(rate)) if len(rate) else 0.0
     detail = float(np.median(measured.sharpness[choice.frames])) - SMOOTH_SHARPNESS if len(choice.frames) else 0.0
+    less = len(choice.frames) < choice.wanted
+    instead = f", instead of {choice.wanted:,}, as others are alike, blurred or too fast," if less else ""
     text = (
-        f"{len(choice.frames):,} of {len(measured):,} frames chosen from {duration(measured.seconds[-1])} of "
+        f"{len(choice.frames):,} of {len(measured):,} frames chosen{instead} from {duration(measured.seconds[-1])} of "
         f"{facts.width}x{facts.height} {facts.coding.label}; detail {detail:.2f} (soft below {SOFT_DETAIL:g}), motion "
         f"{100 * speed:.0f} % of the frame per second, too fast in {100 * choice.fast.mean():.0f} % of the frames"
     )
