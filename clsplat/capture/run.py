@@ -10,11 +10,10 @@ from pathlib import Path
 from clsplat.capture.folder import CaptureFolder
 from clsplat.capture.pipeline import CapturePlan, make_capture
 from clsplat.capture.sources import check_sources, photographs_of
-from clsplat.config.presets import scheduled
+from clsplat.config.training import TrainConfig
 from clsplat.device.selection import open_device
 from clsplat.evaluation.held_out import Evaluation
 from clsplat.runs.locks import locked
-from clsplat.scenes.analysis.photo_findings import SHORT_TRAINING_STEPS
 from clsplat.selftest.driver_check import require
 
 CAPTURE_TURNTABLE_FRAMES = 120
@@ -55,7 +54,7 @@ def run_capture(
     plan = CapturePlan(
         again=again,
         source=json.dumps(photographs),
-        config=scheduled("short" if iterations < SHORT_TRAINING_STEPS.stop else "paper", iterations),
+        config=TrainConfig(iterations=iterations),
         given=frozenset(given),
         frames_seconds=0.0 if sources[0].is_dir() else FRAMES_SECONDS_PER_VIDEO * len(sources),
         turntable_frames=CAPTURE_TURNTABLE_FRAMES,

@@ -12,14 +12,15 @@ from typing import Any
 
 from clsplat.api import train
 from clsplat.capture.progress import CaptureProgress
+from clsplat.config.presets import scheduled
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError, warn
 from clsplat.evaluation.held_out import Evaluation
 from clsplat.files.documents import parse_json, read_document
 from clsplat.runs.run import Run, is_run
-from clsplat.scenes.analysis.photo_findings import findings
-from clsplat.scenes.analysis.recommendations import answered, paragraph
+from clsplat.scenes.analysis.photo_findings import SHORT_TRAINING_STEPS, findings
+from clsplat.scenes.analysis.recommendations import SCHEDULE_SETTING, answered, paragraph
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.selftest.driver_check import require
@@ -41,7 +42,7 @@ def train_scene(
 
     config: settings of a new run.
     given: names of the settings that must not change, while others are adapted to the scene as by `clsplat train
-        --auto`; None to change no setting.
+        --auto`, and the schedule to the number of steps; None to change no setting.
     Raises InputError like `clsplat.train`. After KeyboardInterrupt there is a checkpoint.
     """
     earlier = Run.open(path) if is_run(path) else None
@@ -107,10 +108,17 @@ def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: Cap
 def _adapted(
     folder: Path, scene: Scene, config: TrainConfig, progress: CaptureProgress, given: Collection[str]
 ) -> tuple[Scene, TrainConfig]:
-    """Print the findings about a scene. Returns the scene and the settings that answer the findings."""
+    """Print the findings about a scene. Returns the scene and the settings that answer the findings.
+
+    If no finding asks for a schedule, a training of up to 10,000 steps gets the short schedule.
+    """
     photographs = len(scene.train_views)
     progress("inspecting the photographs")
-    answers, better = answered(findings(scene, config.mask_use, config.iterations), config, given, photographs)
+    found = findings(scene, config.mask_use, config.iterations)
+    answers, better = answered(found, config, given, photographs)
+    has_schedule = any(SCHEDULE_SETTING in answer.settings for answer in answers)
+    if not has_schedule and config.iterations < SHORT_TRAINING_STEPS.stop:
+        answers, better = answered(found, scheduled("short", config.iterations), given, photographs)
     print(paragraph(answers, len(scene.views), auto=True, sampled=len(scene.sampled_views)), file=sys.stderr)
     if (better.mask_use, better.lenses) != (config.mask_use, config.lenses):
         scene = _scene(folder, better, None, progress)
