@@ -4,6 +4,7 @@ viser."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,8 @@ SAME_SURFACE_RATIO = 0.1
 """Largest relative difference of depths in the window that can be on the clicked surface."""
 SURFACE_FITS = 5
 """Number of reweighted least-squares fits of the plane."""
+FLAG_PRECISION = 1e-5
+"""Precision of coordinates in the flag, relative to the distance of the points."""
 MAX_LENGTH_METRES = 1e6
 """Largest length that can be entered, in metres."""
 
@@ -91,9 +94,10 @@ class Measurement:
         shown = f"Distance: {distance:.6g} world units."
         if not 0 < metres <= MAX_LENGTH_METRES or distance == 0:
             return f"{shown} Enter its length in metres for a flag."
-        ends = ",".join(f"{value:.6g}" for point in self.points for value in point)
+        digits = max(0, math.ceil(-math.log10(FLAG_PRECISION * distance)))
+        ends = ",".join(f"{value:.{digits}f}" for point in self.points for value in point)
         return (
             f"{shown} To make it {metres:g} m, give `clsplat sfm` or `clsplat train` the flag\n\n"
-            f"`--scale={ends}={metres:g}`\n\nor scale this model:\n\n"
-            f"`clsplat convert MODEL OUTPUT --scale {metres / distance:.6g}`"
+            f"```\n--scale={ends}={metres:g}\n```\n\nor scale this model:\n\n"
+            f"```\nclsplat convert MODEL OUTPUT --scale {metres / distance:.6g}\n```"
         )

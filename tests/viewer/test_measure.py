@@ -46,7 +46,7 @@ def test_a_click_hits_the_model(default_device: Device) -> None:
     assert measurement.distance == pytest.approx(apart, rel=1e-4)
     assert "Enter its length" in measurement.text(0)
     text = measurement.text(1.25)
-    match = re.search(r"--scale=(\S+)`", text)
+    match = re.search(r"--scale=(\S+)", text)
     assert match is not None
     rule = parse_scale(match.group(1))
     assert rule is not None
@@ -62,6 +62,17 @@ def test_a_click_beside_the_model_is_told(place: tuple[float, float]) -> None:
     depth, alpha = np.full(shape, 3.0, np.float32), np.zeros(shape, np.float32)
     refuses("nothing is there|outside the picture", point_at, CAMERA, depth, alpha, place)
     refuses("nothing is there|outside", point_at, CAMERA, 0 * depth, alpha + 1, place)
+
+
+def test_a_flag_far_from_the_origin_keeps_the_distance() -> None:
+    measurement = Measurement()
+    for point in ((4_500_000.25, -3.0, 700_000.5), (4_500_000.75, -3.0, 700_000.5)):
+        measurement.add(np.array(point))
+    match = re.search(r"--scale=(\S+)", measurement.text(2.0))
+    assert match is not None
+    rule = parse_scale(match.group(1))
+    assert rule is not None
+    assert np.linalg.norm(np.subtract(rule.ends[:3], rule.ends[3:])) == pytest.approx(0.5, rel=1e-4)
 
 
 def test_two_clicks_on_one_point_give_no_flag() -> None:

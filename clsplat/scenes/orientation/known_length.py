@@ -14,8 +14,9 @@ from clsplat.camera import Camera
 from clsplat.config.orientation import ScaleRule
 from clsplat.errors import InputError, examples
 
-MIN_LENGTH_SHARE = 1e-6
-"""Smallest distance that counts as a length, relative to the largest coordinate of its ends: less is rounding."""
+MIN_LENGTH_SHARE = 1e-12
+"""Smallest distance that counts as a length, relative to the largest coordinate of its ends. Smaller ones are rounding
+of float64 coordinates."""
 
 
 def metres_per_unit(rule: ScaleRule, cameras: Mapping[str, Camera]) -> float:
