@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 
 from clsplat.scenes.sfm import database as sfm_database
-from clsplat.scenes.sfm import pairs as sfm_pairs
-from clsplat.scenes.sfm.pairs import Pair
+from clsplat.scenes.sfm import photo_pairs as sfm_pairs
+from clsplat.scenes.sfm.photo_pairs import Pair
 
 PAIRS_FILE = "pairs.txt"
 """File in the worker's folder that lists the pairs for pycolmap, two numbers of photographs on each line."""
@@ -24,7 +24,7 @@ def matched_pairs(
 
     matching: one of SFM_MATCHINGS.
     sequences: names of the frames of each video, in their order.
-    seed: seed of the clustering in `pairs.image_similarity`.
+    seed: seed of the clustering in `photo_pairs.image_similarity`.
     """
     names = sfm_database.image_names(database)
     ids, place = list(names), {name: at for at, name in enumerate(names.values())}

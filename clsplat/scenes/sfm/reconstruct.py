@@ -21,7 +21,7 @@ from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import photos as sfm_photos
-from clsplat.scenes.sfm.pairs import SFM_MATCHINGS
+from clsplat.scenes.sfm.photo_pairs import SFM_MATCHINGS
 from clsplat.scenes.sfm.weights import learned_weights
 from clsplat.scenes.sfm.worker_progress import run_worker
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
