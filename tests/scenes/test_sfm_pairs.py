@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clsplat.scenes.sfm.pipeline import pairs
+from clsplat.scenes.sfm.pipeline import photo_pairs as pairs
 
 NOWHERE = np.full((200, 2), np.nan)
 

@@ -24,7 +24,7 @@ from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm.framing import scale_new, set_frame, turn_new
-from clsplat.scenes.sfm.pipeline.pairs import SFM_MATCHINGS
+from clsplat.scenes.sfm.pipeline.photo_pairs import SFM_MATCHINGS
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
 from clsplat.scenes.sfm.weights import learned_weights
 from clsplat.scenes.sfm.worker_progress import run_worker

@@ -24,7 +24,7 @@ from clsplat.errors import examples
 from clsplat.scenes.sfm.pipeline import database as sfm_database
 from clsplat.scenes.sfm.pipeline.features import camera_batches
 from clsplat.scenes.sfm.pipeline.matching import verification_options
-from clsplat.scenes.sfm.pipeline.pairs import Pair
+from clsplat.scenes.sfm.pipeline.photo_pairs import Pair
 
 ALIKED_INPUTS = ("image", "max_keypoints", "min_score")
 """Names of the network's inputs."""

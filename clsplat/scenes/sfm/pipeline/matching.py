@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 
 from clsplat.scenes.sfm.pipeline import database as sfm_database
-from clsplat.scenes.sfm.pipeline import pairs as sfm_pairs
-from clsplat.scenes.sfm.pipeline.pairs import Pair
+from clsplat.scenes.sfm.pipeline import photo_pairs as sfm_pairs
+from clsplat.scenes.sfm.pipeline.photo_pairs import Pair
 
 PAIRS_FILE = "pairs.txt"
 """File in the worker's folder that lists the pairs for pycolmap, two numbers of photographs on each line."""
