@@ -23,7 +23,7 @@ from clsplat.scenes.loading import load_scene
 
 PAGE = ROOT / "docs/coming-from.md"
 COMMANDS = list(dict.fromkeys(line for line in code_of(PAGE) if line.startswith("clsplat ")))
-SMALLER = {"train": ["--iterations", "3", "--resolution", "64"]}
+SMALLER = {"train": ["--iterations", "3", "--resolution", "64"], "capture": ["--iterations", "3"]}
 """Flags that are added to each command of a verb, so that it takes seconds."""
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -72,7 +72,8 @@ def test_every_command_runs(working_folder: Path, capsys: Capture) -> None:
         shown[command] = printed(capsys, [verb, *words, *SMALLER.get(verb, [])]).out
     assert len(shown) == len(COMMANDS) > 14
     runs = {path.parent.name for path in working_folder.glob("*/model.ply")}
-    assert runs == {"run", "run-mcmc", "run-nerfstudio", "run-random", "run-auto", "run-colmap"}
+    assert runs == {"run", "run-mcmc", "run-nerfstudio", "run-random", "run-colmap"}
+    assert (working_folder / "shot/run/model.ply").is_file() and (working_folder / "shot/report.html").is_file()
     assert [len(list(working_folder.glob(f"{name}/*.png"))) for name in ("frames", "views")] == [2, 10]
     assert re.search("antialiased +yes", shown["clsplat info postshot.ply"])
     assert 0 < len(Gaussians.load("part.ply")) < len(Gaussians.load("postshot.ply"))
