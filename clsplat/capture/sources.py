@@ -36,8 +36,8 @@ class PhotographSource:
 def check_sources(sources: Sequence[Path], output: Path, frames: int | None = None) -> None:
     """Check the input of a capture before anything is written.
 
-    Raises InputError for input that is missing or is not a video or folder, for a folder among several inputs, and for
-    an output inside the input, whose pictures would count as photographs.
+    Raises InputError for input that is missing or is not a video or folder, and for a folder among several inputs.
+    Also for an output inside the input, as its pictures would count as photographs.
     """
     if not sources:
         raise InputError("INPUT is missing, expected a folder of photographs, or videos")

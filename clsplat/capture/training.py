@@ -41,8 +41,8 @@ def train_scene(
     """Train the scene in `folder` to a run at `path`. A run that is there continues, and a finished one is returned.
 
     config: settings of a new run.
-    given: names of the settings that must not change, while others are adapted to the scene as by `clsplat train
-        --auto`, and the schedule to the number of steps; None to change no setting.
+    given: names of the settings that must not change; None to change no setting. Others are adapted to the scene as
+    by `clsplat train --auto`, and the schedule to the number of steps.
     Raises InputError like `clsplat.train`. After KeyboardInterrupt there is a checkpoint.
     """
     earlier = Run.open(path) if is_run(path) else None

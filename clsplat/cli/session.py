@@ -82,7 +82,7 @@ def load_scene(
         lenses=lenses,
         missing=missing,
         progress=StageProgress(),
-        **({"frame": frame} if frame else {}),
+        frame=frame,
     )
     for text in scene.warnings:
         warn(text)

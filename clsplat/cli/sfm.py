@@ -53,8 +53,8 @@ class SfmVerb(Verb):
     axes, which are arbitrary. If not given: up, but an existing scene keeps its frame. Cameras are not recovered anew.
     sparse/0/frame.json has the transform."""
     scale: str = ""
-    """Length that makes the scene's units metres: A.JPG,B.JPG=METRES, the distance between the cameras of two photos;
-    X,Y,Z,X,Y,Z=METRES, between two points of the scene (the viewer measures them); or gps, the positions in the photos'
+    """Length that makes the scene's units metres. A.JPG,B.JPG=METRES: the distance between the cameras of two photos.
+    X,Y,Z,X,Y,Z=METRES: between two points of the scene, which the viewer measures. gps: the positions in the photos'
     EXIF, with z to the north if the scene is turned up too. If not given: no unit is known."""
     masks: Flag = False
     """Detect no features in the black areas of the photos' masks (masks/IMAGE.jpg.png and the like). The undistorted

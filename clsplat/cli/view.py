@@ -152,7 +152,7 @@ def _scene(services: Services, path: Path | None, run: Run | None, *, given: boo
             masks=config.mask_use,
             lenses=config.lenses,
             missing=config.missing,
-            **({"frame": frame} if frame else {}),
+            frame=frame,
         )
     except (InputError, OSError) as error:
         if given:

@@ -125,10 +125,10 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
     schedule: None means short for fast, and paper for the other presets.
 
     fast saves time by less work in a step. Photographs have a quarter of their width and height for the first 1/14 of
-    the steps, and half until 2/7 of the steps. There are fewer Gaussians: the gradient threshold is higher, splits are
-    along the longest axis, and Gaussians that add less than a tenth of a pixel to every view are pruned. Means, scales
-    and rotations have two to four times the schedule's rates. The higher SH bands are updated in every second step. The
-    rasterizer has the approximations of RASTERIZER_PRESETS (docs/decisions/0015-the-fast-preset.md).
+    the steps, and half until 2/7 of the steps. There are fewer Gaussians: the gradient threshold is higher, and
+    splits are along the longest axis. Gaussians that add less than a tenth of a pixel to every view are pruned. Means,
+    scales and rotations have two to four times the schedule's rates. The higher SH bands are updated in every second
+    step. The rasterizer has the approximations of RASTERIZER_PRESETS (docs/decisions/0015-the-fast-preset.md).
 
     Raises InputError for fast with high-rates.
     """

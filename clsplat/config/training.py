@@ -280,8 +280,8 @@ class TrainConfig:
     the photographs' metadata, a level plane of points, and the cameras. none: keep the frame of the scene's files;
     photos alone are turned by clsplat sfm. frame.json in the run has the transform."""
     scale: str = ""
-    """Length that makes world units metres: A.JPG,B.JPG=METRES, the distance between the cameras of two photographs;
-    X,Y,Z,X,Y,Z=METRES, between two points in the scene's frame; or gps, the positions in the photographs' EXIF. With
+    """Length that makes world units metres. A.JPG,B.JPG=METRES: the distance between the cameras of two photographs.
+    X,Y,Z,X,Y,Z=METRES: between two points in the scene's frame. gps: the positions in the photographs' EXIF. With
     --orient up and gps, z points north. Depth maps are scaled too. If empty: the scale of the scene's files."""
     lenses: Lenses = "undistort"
     """Handling of fisheye photographs. undistort: convert to the pinhole pictures that they contain. native: train with

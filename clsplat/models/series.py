@@ -35,9 +35,9 @@ class ModelSeries:
     """A model that changes over time, given by samples at some frames. Thread-safe.
 
     Between two samples Gaussians are interpolated, means linearly, if each row is the same Gaussian in both; otherwise
-    the nearer sample is used. Before the first sample the first is used, after the last sample the last. Unless `held`
-    is set, the means of that sample continue their motion: they move as far in a time t before the first sample as in
-    the time t after it, and as far in a time t after the last sample as in the time t before it.
+    the nearer sample is used. Before the first sample the first is used, after the last sample the last. Unless
+    `held` is set, the means of that sample continue their motion. They move as far in a time t before the first
+    sample as in the time t after it. After the last sample the same holds, in reverse.
     """
 
     def __init__(

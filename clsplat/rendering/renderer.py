@@ -174,12 +174,11 @@ class Renderer:
         camera : Camera
             In world coordinates.
         wanted : collection of str
-            Features by their names in the kernels (`clsplat.config.channels`).
+            Features, by their names in `clsplat.config.channels`.
         after, before : Camera, optional
             Cameras for motion and backward motion. None means the view's own camera.
         moved, earlier : Gaussians, optional
-            The same Gaussians with their means at the time of `after` and of `before`. None means that they do not
-            move.
+            The Gaussians at the time of `after` and of `before`. None means that they do not move.
         background, contiguous, holdout
             As for `render`.
 
@@ -194,8 +193,8 @@ class Renderer:
         Raises
         ------
         InputError
-            If `wanted` has motion or backward, and the other camera has another projection or `camera` is a fisheye
-            with coefficients.
+            For motion or backward, if the other camera has another projection or `camera` is a fisheye with
+            coefficients.
         ValueError
             If the number of moved Gaussians differs.
         """

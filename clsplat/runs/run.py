@@ -41,7 +41,7 @@ from clsplat.runs.settings import (
     read_config,
 )
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
-from clsplat.scenes.readers.colmap import frame_of_files
+from clsplat.scenes.readers.scene_frame import frame_of_files
 
 KEPT_CHECKPOINTS = 2
 """Number of latest checkpoints that a run keeps."""

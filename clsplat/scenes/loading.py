@@ -31,7 +31,7 @@ from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transf
 from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
-from clsplat.scenes.readers.colmap import frame_of_files
+from clsplat.scenes.readers.scene_frame import frame_of_files
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
@@ -80,8 +80,7 @@ def load_scene(
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
-    frame: how the frame of the files is changed, such as `clsplat.config.orientation.FrameUse("up")`, or the frame of
-        an earlier run, which the scene gets.
+    frame: a change of the files' frame, such as `FrameUse("up")`, or the frame of an earlier run, which the scene gets.
 
     A folder of photographs or videos, and a video, goes through `clsplat.scenes.sfm.reconstruct` first. An earlier
     result for the same photographs is reused.
@@ -95,9 +94,7 @@ def load_scene(
     (`outliers`) and implausible cameras (`camera_checks`) are reported too.
     """
     path = Path(path)
-    for name, number in (("resolution", resolution), ("test_every", test_every), ("test_most", test_most)):
-        if (expected := misfit(int, number)) or number < 0:
-            raise InputError(f"{name} {number}: expected {expected or '0 or more'}")
+    _check_counts(resolution=resolution, test_every=test_every, test_most=test_most)
     kind = detect(path)
     if images is not None and kind == "photos":
         raise InputError(
@@ -105,8 +102,7 @@ def load_scene(
         )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        files = _read(path, kind, images, missing, masks, work_dir, progress)
-        files = _reframed(files, path, frame)
+        files = _reframed(_read(path, kind, images, missing, masks, work_dir, progress), path, frame)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
         # Outlier cameras are not checked, because `_scene` has already warned of them.
@@ -115,6 +111,13 @@ def load_scene(
             warn(doubt)
     scene.warnings = [plain(str(warning.message)) for warning in caught]
     return scene
+
+
+def _check_counts(**counts: int) -> None:
+    """Raise InputError for an argument of `load_scene` that is no integer of at least 0."""
+    for name, number in counts.items():
+        if (expected := misfit(int, number)) or number < 0:
+            raise InputError(f"{name} {number}: expected {expected or '0 or more'}")
 
 
 @dataclass(frozen=True)

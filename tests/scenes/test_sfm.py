@@ -302,18 +302,6 @@ def test_a_photo_of_another_kind_than_its_name_says_is_written_anew(
     assert np.abs(np.asarray(Pillow.open(tmp_path / name).convert("RGB"), float) - picture).mean() < off
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_what_counts_as_transparent(dtype):
-    opaque = np.iinfo(dtype).max if dtype.startswith("u") else 1
-    pixels = np.full((3, 4, 4), opaque, dtype)
-    assert not sfm_photos._is_transparent(pixels, 3)
-    pixels[:, :, 0] = 0
-    assert not sfm_photos._is_transparent(pixels, 3)
-    assert not sfm_photos._is_transparent(pixels, -1)
-    pixels[1, 1, 3] = 0
-    assert sfm_photos._is_transparent(pixels, 3)
-
-
 def test_bad_folders(tmp_path, photos):
     refuses(r"missing: no such folder", sfm.reconstruct, tmp_path / "missing", tmp_path / "out")
     (tmp_path / "empty").mkdir()
@@ -420,16 +408,6 @@ def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkey
     monkeypatch.setattr(sys, "executable", "/bin/false")
     refuses("structure from motion failed", sfm.reconstruct, photos, tmp_path / "out", error=ClsplatError)
     assert leftovers(tmp_path) == []
-
-
-def test_camera_groups():
-    photo = sfm_photos.Photo
-    wide, tall = photo("a", "a", 40, 30, ()), photo("b", "b", 30, 40, ())
-    zoomed, other = photo("c", "c", 40, 30, ("x", "y", "50")), photo("d", "d", 40, 30, ())
-    everything = [wide, tall, zoomed, other]
-    assert sfm_photos.camera_groups(everything, "auto") == [["a", "d"], ["b"], ["c"]]
-    assert sfm_photos.camera_groups(everything, True) == [["a", "c", "d"], ["b"]]
-    assert sfm_photos.camera_groups(everything, False) == [["a"], ["b"], ["c"], ["d"]]
 
 
 @pytest.mark.slow

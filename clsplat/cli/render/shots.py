@@ -23,7 +23,7 @@ from clsplat.models.formats.usd import USD_SUFFIXES
 from clsplat.runs.run import run_of
 from clsplat.runs.scene_record import own_cameras
 from clsplat.scenes.orientation.level import COLMAP_UP
-from clsplat.scenes.readers.colmap import frame_of_files
+from clsplat.scenes.readers.scene_frame import frame_of_files
 from clsplat.sequence.job_models import JobModels
 from clsplat.sequence.task import Task
 from clsplat.shots import Shot, check_around, choose_shot, shot_around

@@ -102,8 +102,8 @@ def _developed(path: Path) -> NDArray[Any]:
 def _full_exposure(raw: Any) -> int | None:
     """Return the number of levels from black to white, or None to keep LibRaw's number.
 
-    LibRaw 0.22 does not subtract the black level from the white level if a DNG has no colour filter pattern (LinearRaw,
-    which phones write) and a black level for each channel. White would then be up to 5 % too dark.
+    For LinearRaw DNGs, as phones write them, with a black level for each channel, LibRaw 0.22 does not subtract the
+    black level from the white level. White would then be up to 5 % too dark.
     """
     import rawpy
 

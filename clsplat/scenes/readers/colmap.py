@@ -45,7 +45,6 @@ from clsplat.scenes.dataset import (
     given_in_parts,
     in_pixels,
 )
-from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame, read_frame
 from clsplat.scenes.photo_names import is_legible, legible, match, slashed
 
 COLMAP_FILE_STEMS = ("cameras", "images", "points3D")
@@ -81,15 +80,6 @@ def find_model(folder: Path) -> Path | None:
         if _is_model(candidate):
             return candidate
     return None
-
-
-def frame_of_files(folder: Path) -> SceneFrame:
-    """Return the frame of a scene's files, recorded beside its COLMAP model. Raises InputError for a damaged record.
-
-    folder: as for `find_model`. Without a COLMAP model or a record, it is the frame that the cameras had first.
-    """
-    model = find_model(folder)
-    return SOURCE_FRAME if model is None else read_frame(model)
 
 
 def read_model(folder: Path) -> DataSet:

@@ -12,8 +12,8 @@ from clsplat.errors import examples
 MAX_FOCAL_DIFFERENCE = 0.1
 """Largest difference between the focal length found and EXIF's, as a fraction of EXIF's, without a warning.
 
-Smaller differences are usual: EXIF rounds the 35 mm equivalent to whole millimetres, which is up to 4 % of 13 mm, and
-focusing changes a focal length by a few per cent.
+Smaller differences are usual. EXIF rounds the 35 mm equivalent to whole millimetres, which is up to 4 % of 13 mm.
+Focusing changes a focal length by a few per cent.
 """
 
 

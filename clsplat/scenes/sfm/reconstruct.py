@@ -6,10 +6,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from clsplat.config.masks import MaskUse
@@ -119,72 +118,78 @@ def reconstruct(
 ) -> Path:
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
 
-    images: a folder with photographs, videos or both; or a video. Frames of videos are written to a folder beside the
-        output (`video_frames.frames_folder`), and used like photographs. A folder that `take_frames` wrote counts as
-        the videos.
+    images: a folder with photographs, videos or both, or a video. Frames of videos are written to a folder, and used
+        like photographs. A folder that `take_frames` wrote counts as the videos.
 
-    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points; frame.json has the
-    transform from COLMAP's frame) and `sfm.json`. The folder is created when all files are complete. An existing result
-    for the same photographs and settings is reused.
+    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points, frame.json) and
+    sfm.json. It is created when all files are complete. A result for the same photographs and settings is reused.
 
-    threads: number of CPU threads; None for one per core.
-    overwrite: replace a result of other photographs.
-    masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
-        `masks/IMAGE.jpg.png`, with white for kept pixels.
-    frames: number of frames of each video; None for a number by its length and motion.
-    frames_to: folder for the frames; None for a folder beside the output.
+    threads: number of CPU threads; None for one per core. overwrite: replace a result of other photographs.
+    masks: use of masks and alpha. Masked pixels get no features. The output gets `masks/IMAGE.jpg.png`, white for kept.
+    frames, frames_to: number of frames of each video, and their folder; None for a number by length and motion, and
+        for a folder beside the output (`video_frames.frames_folder`).
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
-    Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
-
-    Warns of copies, of photographs that get no pose, have an unreadable format, or lost their alpha, and of focal
-    lengths that differ from EXIF's. Raises InputError for a folder without photographs, a photograph that does not
-    decode, and an existing output that must not be replaced. Also raises InputError if the cameras cannot be recovered.
+    Warns of copies, of which one is used, of photographs without a pose, in an unreadable format or without their
+    alpha, and of focal lengths that differ from EXIF's. Raises InputError for a folder without photographs, a
+    photograph that does not decode, an output that must not be replaced, and if the cameras cannot be recovered.
     Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain.
     """
     report = progress or no_progress
     settings.check()
     videos = frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to)
-    paths, left_out = videos.photos_beside(images, output)
-    copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
-    paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
+    paths, copies, left_out = _files(images, output, videos)
     mask_files = _masks(images, paths, masks)
     settings, weights = _with_weights(settings)
-    described = f"{settings}{_described(masks, mask_files)}{_identity(weights)}{videos.fingerprint}"
-    fingerprint = sfm_photos.fingerprint(images, paths, described)
+    asked = f"{settings}{_described(masks, mask_files)}{_identity(weights)}{videos.fingerprint}"
+    fingerprint = sfm_photos.fingerprint(images, paths, asked)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
         set_frame(output, images, settings.frame, output)
         return output
     _require_enough(images, len(paths) + len(videos.paths))
+    _warn_of_left_out(images, left_out)
+    workers = threads or os.cpu_count() or 1
+    output.parent.mkdir(parents=True, exist_ok=True)
+    # Work in the output's parent folder, so that the last step is a rename within one file system.
+    with TemporaryDirectory(prefix=f".{output.name}-sfm-", dir=output.parent, ignore_cleanup_errors=True) as folder:
+        work = Path(folder)
+        photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
+        masked = _staged_masks(photos, mask_files, masks, work)
+        task = sfm_task(settings, photos, masked, videos.sequences, work, workers) | {"weights": str(weights or "")}
+        result = _recovered(images, len(photos), run_worker(task, work, report))
+        turn_new(work / "result", images, settings.frame, images)
+        _write_record(work / "result", fingerprint, photos, result)
+        _warn_of_losses(images, photos, result, work / "result" / "images", masks)
+        move_into_place(work, output)
+    scale_new(output, images, settings.frame)
+    return output
+
+
+def _files(
+    images: Path, output: Path, videos: VideoFrames
+) -> tuple[list[Path], dict[str, sfm_copies.Copy], dict[str, list[Path]]]:
+    """Return the photographs, the copies by name that are not among them, and the files left out by the reason."""
+    paths, left_out = videos.photos_beside(images, output)
+    copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
+    return [path for path in paths if sfm_photos.photo_name(images, path) not in copies], copies, left_out
+
+
+def _warn_of_left_out(images: Path, left_out: dict[str, list[Path]]) -> None:
+    """Warn of photographs and videos that are left out. left_out: their files by the reason."""
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
         kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
         warn(f"{images}: {_listed(names, kind)} left out: {why}")
 
-    workers = threads or os.cpu_count() or 1
-    output.parent.mkdir(parents=True, exist_ok=True)
-    # Work in the output's parent folder, so that the last step is a rename within one file system.
-    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
-    try:
-        photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
-        masked = _staged_masks(photos, mask_files, masks, work)
-        task = sfm_task(settings, photos, masked, videos.sequences, work, workers) | {"weights": str(weights or "")}
-        answer = run_worker(task, work, report)
-        if "refused" in answer:
-            raise InputError(answer["refused"])
-        if "failure" in answer:
-            raise InputError(_no_model(images, len(photos), answer["failure"]))
-        turn_new(work / "result", images, settings.frame, images)
-        _write_record(work / "result", fingerprint, photos, answer["result"])
-        _warn_of_losses(images, photos, answer["result"], work / "result" / "images", masks)
-        if told := focal_lengths.told(answer["result"].get("focal_lengths", ())):
-            warn(f"{images}: {told}")
-        move_into_place(work, output)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-    scale_new(output, images, settings.frame)
-    return output
+
+def _recovered(images: Path, count: int, answer: dict[str, Any]) -> dict[str, Any]:
+    """Return the result in the worker's answer. Raises InputError if it has none. count: number of photographs."""
+    if "refused" in answer:
+        raise InputError(answer["refused"])
+    if "failure" in answer:
+        raise InputError(_no_model(images, count, answer["failure"]))
+    return dict(answer["result"])
 
 
 def _with_weights(settings: SfmSettings) -> tuple[SfmSettings, Path | None]:
@@ -308,6 +313,8 @@ def _warn_of_losses(
     result: folder of the undistorted photographs.
     masks: use of masks and alpha. If alpha was used as a mask, its loss does not matter.
     """
+    if told := focal_lengths.told(answer.get("focal_lengths", ())):
+        warn(f"{images}: {told}")
     registered, others = answer["registered"], answer["fragments"]
     for names in others:
         warn(

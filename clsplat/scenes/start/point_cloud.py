@@ -153,8 +153,8 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
     """Raise InputError for points (N, 3) of a cloud that do not fit the scene's cameras.
 
-    Either hardly any of the points is in a training photograph, or their median distance from the cameras that see them
-    differs much from the distance of the scene's own points.
+    Either hardly any of the points is in a training photograph, or they are much nearer to the cameras that see them,
+    or farther, than the scene's own points, by the median distance.
     """
     sample = _spread(points)
     seen, depths = _seen(sample, scene)

@@ -327,15 +327,15 @@ def write_frame(path: Path, pixels: NDArray[np.uint8], make: str = "", model: st
 
 def _described(facts: VideoFacts, turns: int) -> dict[str, Any]:
     """Return a video's facts for the table; facts that the file lacks are left out."""
-    known: dict[str, Any] = {
+    optional = {"place": list(facts.place), "time": facts.time, "make": facts.make, "model": facts.model}
+    return {
         "width": facts.width,
         "height": facts.height,
         "turned": 90 * turns,
         "codec": facts.codec,
         "range": facts.coding.label,
+        **{key: value for key, value in optional.items() if value},
     }
-    optional = {"place": list(facts.place), "time": facts.time, "make": facts.make, "model": facts.model}
-    return {**known, **{key: value for key, value in optional.items() if value}}
 
 
 def _told(told: Preview) -> dict[str, Any]:

@@ -23,8 +23,8 @@ SOFT_DETAIL = 0.05
 MIN_PARALLAX = 0.06
 """Parallax (`parallax_of`) below which a camera turns rather than moves.
 
-In the demo's scene, a camera that turns on the spot has 0.04, one that flies over the flat floor 0.07, and one that
-walks sideways or around the scene 0.45 to 0.8.
+In the demo's scene, a camera that turns on the spot has 0.04, and one that flies over the flat floor 0.07. One that
+walks sideways or around the scene has 0.45 to 0.8.
 """
 MIN_TRAVELLED = 0.1
 """Length of the camera's path, in longer sides, below which a video hardly shows different viewpoints. A walk of 60

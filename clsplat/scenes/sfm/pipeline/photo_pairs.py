@@ -107,9 +107,9 @@ def joined(*lists: Iterable[Pair]) -> list[Pair]:
 def image_similarity(descriptors: Sequence[NDArray[Any]], seed: int) -> NDArray[np.float64]:
     """Return the similarity of every two photographs (N, N), from -1 to 1, by their features.
 
-    Each photograph is described by a VLAD vector (Jegou, Douze, Schmid, Perez, 2010): the sums of the differences
-    between its descriptors and the nearest visual word, normalised for each word and as a whole. The visual words are
-    the centres of a k-means clustering of the photographs' own descriptors, so that no file is needed.
+    Each photograph is described by a VLAD vector (Jegou, Douze, Schmid, Perez, 2010). It has the sums of the
+    differences between descriptors and their nearest visual word, normalised by word and as a whole. The visual words
+    are the centres of a k-means clustering of the photographs' own descriptors, so that no file is needed.
 
     descriptors: for each photograph the descriptors (features, dimensions) of its largest features.
     seed: seed of the clustering. The same descriptors and seed give the same similarities.

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clsplat.scenes.sfm import photos as sfm_photos
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_what_counts_as_transparent(dtype):
+    opaque = np.iinfo(dtype).max if dtype.startswith("u") else 1
+    pixels = np.full((3, 4, 4), opaque, dtype)
+    assert not sfm_photos._is_transparent(pixels, 3)
+    pixels[:, :, 0] = 0
+    assert not sfm_photos._is_transparent(pixels, 3)
+    assert not sfm_photos._is_transparent(pixels, -1)
+    pixels[1, 1, 3] = 0
+    assert sfm_photos._is_transparent(pixels, 3)
+
+
+def test_camera_groups():
+    photo = sfm_photos.Photo
+    wide, tall = photo("a", "a", 40, 30, ()), photo("b", "b", 30, 40, ())
+    zoomed, other = photo("c", "c", 40, 30, ("x", "y", "50")), photo("d", "d", 40, 30, ())
+    everything = [wide, tall, zoomed, other]
+    assert sfm_photos.camera_groups(everything, "auto") == [["a", "d"], ["b"], ["c"]]
+    assert sfm_photos.camera_groups(everything, True) == [["a", "c", "d"], ["b"]]
+    assert sfm_photos.camera_groups(everything, False) == [["a"], ["b"], ["c"], ["d"]]
