@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -18,6 +19,7 @@ from clsplat.arrays import Float64
 from clsplat.config.depth import DepthUse
 from clsplat.config.orientation import FrameUse
 from clsplat.config.points import StartPoints
+from clsplat.images.geotags import GpsPosition
 from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
@@ -118,6 +120,32 @@ def test_points_of_files_tracks_and_depth_maps_follow(folder: Path, tmp_path: Pa
     mapped = with_depths(load_scene(folder, frame=use), DepthUse(source="maps")).train_views[0]
     assert mapped.depth is not None
     assert mapped.depth.unit == pytest.approx(2)
+
+
+@pytest.mark.parametrize("orient", ["up", None])
+def test_gps_scales_with_and_without_a_turn(
+    orient: Literal["up"] | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ring of radius 4, which is 40 m: its cameras are 12 units from the middle in the scene's files."""
+    places = np.stack([ring.centre_of(pose) for pose in ring.poses()])
+    enu = 10 * places[:, [0, 2, 1]] * (1, 1, -1)  # x east, y down, z north
+    globe = pycolmap.GPSTransform().enu_to_ellipsoid(enu, -33.0, 151.0, 20.0)
+    positions = {name: GpsPosition(*row) for name, row in zip(ring.NAMES, globe.tolist(), strict=True)}
+    monkeypatch.setattr("clsplat.scenes.orientation.new_frame.gps_of", lambda path: positions[path.name])
+    scene = load_scene(folder, frame=FrameUse(orient, "gps"))
+    assert scene.frame.metres
+    centres = np.stack([view.camera.position for view in scene.views])
+    apart = np.linalg.norm(centres[0] - centres[10])
+    assert apart == pytest.approx(10 * np.linalg.norm(places[0] - places[10]), rel=1e-3)  # the floor's noise tilts up
+    if orient == "up":
+        np.testing.assert_allclose(centres - centres[0], 10 * (places - places[0]), atol=0.1)
+        assert scene.frame.origin == pytest.approx((-33.0, 151.0, 20.0), abs=0.1)
+        assert scene.frame.origin[:2] == pytest.approx((-33.0, 151.0), abs=1e-5)
+    else:
+        assert not scene.frame.upright
+        assert scene.frame.origin == ()
+        turned_by = scene.views[0].camera.rotation.T @ load_scene(folder).views[0].camera.rotation
+        np.testing.assert_allclose(turned_by, np.eye(3), atol=1e-12)
 
 
 def test_a_transforms_json_is_turned_too(tmp_path: Path) -> None:
