@@ -17,6 +17,7 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.errors import InputError
+from clsplat.images.decoders.decoded_photo import EXIF_ORIENTATION_ATTRIBUTE
 from clsplat.images.reading import open_image
 
 MAX_METADATA_BYTES = 1 << 18
@@ -100,22 +101,28 @@ def gravity_of(path: Path, *, upright: bool) -> Float64 | None:
     acceleration = _apple_acceleration(data)
     if acceleration is None:
         return None
-    orientation = _orientation(path)
+    orientation = _orientation(path, upright=upright)
     if orientation not in _PICTURE_FROM_PHONE:
         return None
-    axes = np.array(_PICTURE_FROM_PHONE[orientation if upright else 1], np.float64)
+    axes = np.array(_PICTURE_FROM_PHONE[orientation], np.float64)
     gravity = axes @ acceleration
     return np.asarray(gravity / np.linalg.norm(gravity))
 
 
-def _orientation(path: Path) -> int:
+def _orientation(path: Path, *, upright: bool) -> int:
+    """Return the EXIF orientation that turns the sensor's picture to the picture whose axes are wanted; 0 if unknown.
+
+    upright: as for `gravity_of`. The decoded pixels of HEIF and AVIF, as stored, are upright already.
+    """
     try:
         source = open_image(path)
     except InputError:
         return 0
-    orientation = int(source.spec().get_int_attribute("Orientation", 1))
+    spec = source.spec()
     source.close()
-    return orientation
+    if orientation := int(spec.get_int_attribute("Orientation", 0)):
+        return orientation if upright or orientation not in _PICTURE_FROM_PHONE else 1
+    return int(spec.get_int_attribute(EXIF_ORIENTATION_ATTRIBUTE, 1))
 
 
 def _apple_acceleration(data: bytes) -> Float64 | None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from camera_files import EXIF_IFD, write_heic
 
 from clsplat.images.geotags import GpsPosition, gps_of, gravity_of
 
@@ -94,6 +95,19 @@ def test_gravity_of_a_phone_points_down_in_the_upright_picture(orientation: int,
     # the orientation turns the stored picture's down to the upright picture's: 6 by 90 degrees clockwise
     down = {1: (0, 1, 0), 3: (0, -1, 0), 6: (1, 0, 0), 8: (-1, 0, 0)}[orientation]
     np.testing.assert_allclose(stored, down, atol=1e-12)
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_gravity_of_a_phones_heic_points_down(orientation: int, tmp_path: Path) -> None:
+    """The decoder turns HEIC upright, so that both kinds of axes are those of the upright picture."""
+    from PIL import Image
+
+    record = Image.Exif()
+    record[0x112] = orientation
+    record.get_ifd(EXIF_IFD)[0x927C] = note(UPRIGHT[orientation])  # type: ignore[arg-type]  # Apple's maker note
+    file = write_heic(tmp_path / "a.heic", np.full((48, 64, 3), 128, np.uint8), record.tobytes())
+    for upright in (True, False):
+        np.testing.assert_allclose(gravity_of(file, upright=upright), (0, 1, 0), atol=1e-12)
 
 
 def test_a_phone_that_looks_down_has_gravity_ahead(tmp_path: Path) -> None:

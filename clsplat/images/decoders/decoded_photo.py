@@ -20,12 +20,15 @@ from clsplat.errors import InputError
 
 PHOTOS_EXTRA = "pip install 'clsplat[photos]'"
 """Command that installs the libraries for HEIC, AVIF and raw files."""
+EXIF_ORIENTATION_ATTRIBUTE = "clsplat:ExifOrientation"
+"""Attribute of a photograph with the orientation in its EXIF data, which the decoder ignores. Apple's accelerometer has
+the axes of the sensor, so that its reader needs the orientation."""
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _EXIF_TEXTS = {(0, 0x10F): "Make", (0, 0x110): "Model", (_EXIF_IFD, 0xA433): "Exif:LensMake",
                (_EXIF_IFD, 0xA434): "Exif:LensModel", (_GPS_IFD, 1): "GPS:LatitudeRef",
-               (_GPS_IFD, 3): "GPS:LongitudeRef"}  # fmt: skip
+               (_GPS_IFD, 3): "GPS:LongitudeRef", (_GPS_IFD, 9): "GPS:Status"}  # fmt: skip
 """OpenImageIO's names of EXIF tags whose values are texts, by directory (0: the first one) and number of the tag."""
-_EXIF_INTEGERS = {(_EXIF_IFD, 0x8827): "Exif:PhotographicSensitivity",
+_EXIF_INTEGERS = {(0, 0x112): EXIF_ORIENTATION_ATTRIBUTE, (_EXIF_IFD, 0x8827): "Exif:PhotographicSensitivity",
                   (_EXIF_IFD, 0xA405): "Exif:FocalLengthIn35mmFilm",
                   (_EXIF_IFD, 0xA210): "Exif:FocalPlaneResolutionUnit", (_EXIF_IFD, 0xA002): "Exif:PixelXDimension",
                   (_EXIF_IFD, 0xA003): "Exif:PixelYDimension", (_GPS_IFD, 5): "GPS:AltitudeRef"}  # fmt: skip
@@ -96,7 +99,7 @@ def photo_spec(width: int, height: int, channels: str, form: Any, exif: bytes | 
 
     channels: a letter for each channel, such as "RGBA" or "YA".
     form: OpenImageIO's pixel type.
-    exif: EXIF data, whose values become attributes. Its orientation is ignored.
+    exif: EXIF data, whose values become attributes. Its orientation becomes EXIF_ORIENTATION_ATTRIBUTE.
     """
     spec = oiio.ImageSpec(width, height, len(channels), form)
     spec.channelnames = tuple(channels)
