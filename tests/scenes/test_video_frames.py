@@ -18,8 +18,7 @@ from calls import refuses, warnings_of
 from needs import require
 from numpy.typing import NDArray
 from OpenImageIO import ImageInput
-from scipy import ndimage
-from walk_videos import Walk, walk, write_walk
+from walk_videos import Walk, sliding, walk, write_walk
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.images.video import frame_planes, prores_planes, video_writer
@@ -31,6 +30,7 @@ require("av")
 import av  # noqa: E402
 
 WIDTH, HEIGHT, COUNT = 96, 72, 60
+STILL = sliding(10)
 VARIANTS = {"plain": {}, "hlg": {"hlg": True}, "turned": {"turns": 1}}
 
 
@@ -123,13 +123,6 @@ def test_several_videos_have_folders_of_their_names(videos: dict[str, Path], tmp
     assert [len(names) for names in frame_sequences(tmp_path / "out")] == [3, 3]
 
 
-def still(index: int, width: int = 64, height: int = 48) -> NDArray[np.float32]:
-    """A textured picture that moves by 3 pixels from frame to frame."""
-    noise = ndimage.gaussian_filter(np.random.default_rng(0).uniform(0, 1, (height, 240, 3)), (1.5, 1.5, 0))
-    picture = (noise - noise.min()) / (noise.max() - noise.min())
-    return np.asarray(picture[:, 3 * index :][:, :width], np.float32)
-
-
 @pytest.mark.parametrize(
     ("name", "codec", "form"),
     [
@@ -148,14 +141,14 @@ def test_other_codecs_of_ten_frames(name: str, codec: str, form: str, tmp_path: 
         if codec == "libx265":
             stream.codec_context.options = {"x265-params": "log-level=none:pools=1:frame-threads=1"}
         for index in range(10):
-            frame = av.VideoFrame.from_ndarray(np.rint(255 * still(index)).astype(np.uint8), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(np.rint(255 * STILL[index]).astype(np.uint8), format="rgb24")
             container.mux(stream.encode(frame.reformat(format=form)))
         container.mux(stream.encode(None))
     taken = take_frames([tmp_path / name], tmp_path / "out", count=10)
     assert len(taken.names) == 10
     for index in (0, 9):
         pixels = read_pixels(tmp_path / "out" / taken.names[index]).astype(float)
-        wanted = 255 * still(index)
+        wanted = 255 * STILL[index]
         if form == "gray":
             wanted = np.repeat((wanted @ [0.299, 0.587, 0.114])[:, :, None], 3, axis=2)
         # default qualities of the codecs, and chroma of half size
@@ -169,11 +162,11 @@ def test_a_video_that_render_wrote(suffix: str, tmp_path: Path) -> None:
     smooth = np.stack([x, y, 0.5 + 0 * x], axis=2).astype(np.float32)
     with video_writer(path, VideoConfig(fps=10)) as writer:
         for index in range(10):
-            image = 0.4 * smooth + 0.1 * still(index)
+            image = 0.4 * smooth + 0.1 * STILL[index]
             writer.add(frame_planes(image) if suffix == "mp4" else prores_planes(image, None, "hq"))
     taken = take_frames([path], tmp_path / "out", count=3)
     number = int(Path(taken.names[0]).stem)
-    error = read_pixels(tmp_path / "out" / taken.names[0]) - 255 * (0.4 * smooth + 0.1 * still(number))
+    error = read_pixels(tmp_path / "out" / taken.names[0]) - 255 * (0.4 * smooth + 0.1 * STILL[number])
     assert np.abs(error).mean() < 3  # the codec's loss, mostly in the noise
     assert np.abs(error.mean(axis=(0, 1))).max() < 0.5  # no level of brightness or colour is lost
 

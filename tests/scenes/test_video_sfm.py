@@ -14,7 +14,7 @@ import pytest
 from calls import Capture, refuses, warnings_of
 from needs import require
 from pictures import write_pixels
-from walk_videos import Walk, walk, write_walk
+from walk_videos import sliding, walk, write_walk
 
 from clsplat.cli.main import main
 from clsplat.scenes.folder_layouts import detect
@@ -24,17 +24,13 @@ from clsplat.scenes.video.frames import frame_sequences, take_frames
 
 require("av")
 
-WIDTH, HEIGHT, COUNT = 96, 72, 24
+COUNT = 24
+FRAMES = sliding(COUNT, 96, 72)
 
 
 @pytest.fixture(scope="module")
-def made() -> Walk:
-    return walk(WIDTH, HEIGHT, COUNT, sub_frames=1)
-
-
-@pytest.fixture(scope="module")
-def video(made: Walk, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_walk(tmp_path_factory.mktemp("videos") / "walk.mp4", made.frames)
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_walk(tmp_path_factory.mktemp("videos") / "walk.mp4", FRAMES)
 
 
 @pytest.fixture
@@ -82,14 +78,14 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
 
 
 def test_videos_and_photographs_in_one_folder_are_several_cameras(
-    video: Path, made: Walk, tmp_path: Path, tasks: list[dict[str, Any]]
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]]
 ) -> None:
     folder = tmp_path / "shot"
     (folder / "more").mkdir(parents=True)
     shutil.copy(video, folder / "walk.mp4")
     shutil.copy(video, folder / "more" / "Walk.MOV")
     for index in (10, 14, 18):
-        write_pixels(folder / f"{index}.png", np.rint(255 * made.frames[index]).astype(np.uint8))
+        write_pixels(folder / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
     (folder / "live.mov").write_bytes(b"a moving photograph")
     shutil.copy(folder / "10.png", folder / "LIVE.png")
     (folder / "live.mov").rename(folder / "LIVE.mov")
@@ -119,9 +115,9 @@ def test_a_table_of_another_program_is_ignored(text: str, tmp_path: Path) -> Non
     assert frame_sequences(tmp_path) == []
 
 
-def test_photographs_alone_have_no_sequences(made: Walk, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+def test_photographs_alone_have_no_sequences(tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
     for index in (10, 14, 18):
-        write_pixels(tmp_path / "in" / f"{index}.png", np.rint(255 * made.frames[index]).astype(np.uint8))
+        write_pixels(tmp_path / "in" / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
     sfm.reconstruct(tmp_path / "in", tmp_path / "scene")
     assert tasks[0]["sequences"] == []
     refuses("--frames 5: .*in has no videos", sfm.reconstruct, tmp_path / "in", tmp_path / "other", frames=5)

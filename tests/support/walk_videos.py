@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from clsplat.camera import Camera
 from clsplat.demo import ray_caster
@@ -68,6 +69,14 @@ def walk(width: int, height: int, count: int, fps: int = 10, sub_frames: int = 3
         parts.append(part)
         cameras.append(shots[sub_frames // 2])
     return Walk(frames, parts, cameras, fps)
+
+
+def sliding(count: int, width: int = 64, height: int = 48) -> list[NDArray[np.float32]]:
+    """Frames of a textured picture that slides by 3 pixels from frame to frame, (height, width, 3) in [0, 1]."""
+    size = (height, width + 3 * count, 3)
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).uniform(0, 1, size), (1.5, 1.5, 0))
+    picture = np.asarray((noise - noise.min()) / (noise.max() - noise.min()), np.float32)
+    return [np.ascontiguousarray(picture[:, 3 * index :][:, :width]) for index in range(count)]
 
 
 def _path(count: int) -> Iterator[tuple[Part, float, float, tuple[float, float]]]:

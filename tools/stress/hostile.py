@@ -443,8 +443,14 @@ _ALL = (
     _one_file("bundle", "trouble-step-0000007.npz", make_bundle, repro_bundle.read_bundle, ARCHIVE, 2),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), BINARY, 1),
     Reader("record", make_record, read_record, ("sfm.json",), DOCUMENT, 1),
-    *(Reader("video", make_video, read_video, ("walk.mp4",), BINARY, 1) for _ in range(bool(find_spec("av")))),
-    Reader("frames", make_frames, read_frames, (f"frames/{FRAME_TABLE_FILE}",), DOCUMENT, 1),
+    *(
+        Reader(name, make, read, (file,), kinds, 1)
+        for name, make, read, file, kinds in (
+            ("video", make_video, read_video, "walk.mp4", BINARY),
+            ("frames", make_frames, read_frames, f"frames/{FRAME_TABLE_FILE}", DOCUMENT),
+        )
+        if find_spec("av")
+    ),
     *(
         _saved(name, TEXT if name == "model.compressed.ply" else BINARY)
         for name in ("model.splat", "model.compressed.ply", "model.spz", "model.sog", "model.glb")

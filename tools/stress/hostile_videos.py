@@ -3,21 +3,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import numpy as np
-from scipy import ndimage
-from walk_videos import write_walk
+from walk_videos import sliding, write_walk
 
-from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, take_frames
+from clsplat.scenes.video.frames import frame_sequences, take_frames
 
 
 def make_video(folder: Path) -> None:
     """Write a video whose textured picture moves."""
-    noise = ndimage.gaussian_filter(np.random.default_rng(0).uniform(0, 1, (48, 120, 3)), (1.5, 1.5, 0))
-    picture = np.asarray((noise - noise.min()) / (noise.max() - noise.min()), np.float32)
-    write_walk(folder / "walk.mp4", [picture[:, 4 * index :][:, :64] for index in range(12)])
+    write_walk(folder / "walk.mp4", sliding(12))
 
 
 def read_video(folder: Path) -> None:
@@ -26,16 +21,12 @@ def read_video(folder: Path) -> None:
 
 
 def make_frames(folder: Path) -> None:
-    """Write a table of frames, with an empty file for each frame."""
-    frames = [{"name": f"walk.mp4/{index:06d}.jpg", "frame": index, "seconds": 0.1 * index} for index in range(3)]
-    for frame in frames:
-        path = folder / "frames" / str(frame["name"])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"")
-    row = {"video": "walk.mp4", "sha256": "0", "asked": None, "frames": frames, "preview": "", "advice": []}
-    (folder / "frames" / FRAME_TABLE_FILE).write_text(json.dumps({"version": 1, "videos": [row]}))
+    """Write a video, and take its frames."""
+    make_video(folder)
+    read_frames(folder)
 
 
 def read_frames(folder: Path) -> None:
-    """Read the order of the frames."""
+    """Use the frames that were taken before, and read their order."""
     frame_sequences(folder / "frames")
+    take_frames([folder / "walk.mp4"], folder / "frames", count=4)

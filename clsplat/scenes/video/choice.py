@@ -118,8 +118,8 @@ def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
 def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
     """Return the length (F,) of the camera's path up to each frame, in longer sides, without fast frames.
 
-    The path has steps of at least MOTION_STEP: the motion of each block is summed as a vector, and counts when the mean
-    length of the sums reaches a step.
+    The path has steps of at least MOTION_STEP: the motion of each block is summed as a vector, until the mean length of
+    the sums reaches a step. Movements there and back in a step lengthen the path only once.
     """
     path, done, step = np.zeros(len(measured)), 0.0, np.zeros_like(measured.flow[0])
     for index in range(1, len(measured)):
@@ -128,9 +128,11 @@ def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
         if not fast[index] and matched.any():
             step = step + np.where(matched[:, None], flow, flow[matched].mean(axis=0))
             length = float(np.linalg.norm(step, axis=1).mean())
+            path[index] = max(path[index - 1], done + length)
             if length >= MOTION_STEP:
                 done, step = done + length, np.zeros_like(step)
-        path[index] = done
+        else:
+            path[index] = path[index - 1]
     return path
 
 
