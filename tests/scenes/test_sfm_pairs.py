@@ -147,6 +147,11 @@ def test_photographs_without_gps_are_paired_by_similarity(database, tmp_path):
     assert {(1, 2), (1, pairs.NEAR_NEIGHBOURS + 1), (20, 60), (40, 60)} <= set(found)
 
 
+def test_spatial_matching_without_gps_is_refused(database, tmp_path):
+    with pytest.raises(matching.NoPositionsError, match="--matching spatial: none of the 60 photos has a GPS position"):
+        matching.matched_pairs(tmp_path, "spatial", [], 0)
+
+
 def test_similar_photographs_are_paired(database, tmp_path):
     chosen, found = matching.matched_pairs(tmp_path, "auto", [], 0)
     assert chosen == "retrieval"

@@ -88,7 +88,11 @@ class Worker:
         except aliked.WeightsError as error:
             self.say(refused=f"{self.task['weights']}: {error}")
             return
-        chosen, pairs = self.match()
+        try:
+            chosen, pairs = self.match()
+        except matching.NoPositionsError as error:
+            self.say(refused=str(error))
+            return
         models = self.map()
         if not models:
             self.say(failure=feature_evidence(self.database))
