@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from clsplat.scenes.sfm.pipeline import matching
 from clsplat.scenes.sfm.pipeline import photo_pairs as pairs
 
 NOWHERE = np.full((200, 2), np.nan)
@@ -105,3 +106,53 @@ def test_what_auto_chooses(count, sequences, positions, chosen):
 @pytest.mark.parametrize("given", [choice for choice in pairs.SFM_MATCHINGS if choice != "auto"])
 def test_what_is_asked_for_is_done(given):
     assert pairs.chosen_matching(given, 100, [range(60)], located(100, 100)) == given
+
+
+@pytest.fixture
+def database(tmp_path, monkeypatch):
+    """Sixty photographs, of which those that are 20 apart show the same. Returns their GPS positions."""
+    positions = np.full((60, 2), np.nan)
+    monkeypatch.setattr(matching.sfm_database, "image_names", lambda _: {at + 1: f"{at:02}.jpg" for at in range(60)})
+    monkeypatch.setattr(matching.sfm_database, "gps_positions", lambda *_: positions)
+    monkeypatch.setattr(
+        matching.sfm_database, "largest_descriptors", lambda *_: descriptors_of([at % 20 for at in range(60)])
+    )
+    return positions
+
+
+def test_pairs_of_a_video_are_neighbours_and_loops(database, tmp_path):
+    frames = [f"{at:02}.jpg" for at in range(30)]
+    chosen, found = matching.matched_pairs(tmp_path, "auto", [frames, ["gone.jpg"]], 0)
+    assert chosen == "video"
+    sequential = {(one + 1, two + 1) for one, two in pairs.sequential_pairs(range(30))}
+    assert sequential <= set(found)
+    assert len(set(found) - sequential) <= 60 * pairs.LOOP_NEIGHBOURS
+    assert {(1, 21), (1, 41), (21, 41), (35, 55)} <= set(found)  # they show the same
+
+
+def test_sequential_pairs_stay_in_their_video(database, tmp_path):
+    videos = [[f"{at:02}.jpg" for at in range(start, start + 20)] for start in (0, 20)]
+    _, found = matching.matched_pairs(tmp_path, "sequential", videos, 0)
+    wanted = [(one + start, two + start) for start in (1, 21) for one, two in pairs.sequential_pairs(range(20))]
+    assert found == sorted(wanted)
+    assert matching.matched_pairs(tmp_path, "sequential", [], 0)[1] == [
+        (one + 1, two + 1) for one, two in pairs.sequential_pairs(range(60))
+    ]
+
+
+def test_photographs_without_gps_are_paired_by_similarity(database, tmp_path):
+    database[:57] = np.stack([np.arange(57) * 10.0, np.zeros(57)], axis=1)
+    chosen, found = matching.matched_pairs(tmp_path, "auto", [], 0)
+    assert chosen == "spatial"
+    assert {(1, 2), (1, pairs.NEAR_NEIGHBOURS + 1), (20, 60), (40, 60)} <= set(found)
+
+
+def test_spatial_matching_without_gps_is_refused(database, tmp_path):
+    with pytest.raises(matching.NoPositionsError, match="--matching spatial: none of the 60 photos has a GPS position"):
+        matching.matched_pairs(tmp_path, "spatial", [], 0)
+
+
+def test_similar_photographs_are_paired(database, tmp_path):
+    chosen, found = matching.matched_pairs(tmp_path, "auto", [], 0)
+    assert chosen == "retrieval"
+    assert {(at + 1, at + 21) for at in range(40)} <= set(found)

@@ -89,7 +89,11 @@ class Worker:
             self.say(refused=f"{self.task['weights']}: {error}")
             return
         given = focal_lengths.from_exif(self.database)
-        chosen, pairs = self.match()
+        try:
+            chosen, pairs = self.match()
+        except matching.NoPositionsError as error:
+            self.say(refused=str(error))
+            return
         models = self.map()
         if not models:
             self.say(failure=feature_evidence(self.database))

@@ -17,6 +17,10 @@ PAIRS_FILE = "pairs.txt"
 """File in the worker's folder that lists the pairs for pycolmap, two numbers of photographs on each line."""
 
 
+class NoPositionsError(Exception):
+    """Error about spatial matching of photographs without GPS positions. Its text is the message."""
+
+
 def matched_pairs(
     database: Path, matching: str, sequences: Sequence[Sequence[str]], seed: int
 ) -> tuple[str, list[Pair]]:
@@ -24,7 +28,9 @@ def matched_pairs(
 
     matching: one of SFM_MATCHINGS.
     sequences: names of the frames of each video, in their order.
-    seed: seed of the clustering in `pairs.image_similarity`.
+    seed: seed of the clustering in `photo_pairs.image_similarity`.
+
+    Raises NoPositionsError for "spatial" if no photograph has a GPS position.
     """
     names = sfm_database.image_names(database)
     ids, place = list(names), {name: at for at, name in enumerate(names.values())}
@@ -43,6 +49,11 @@ def matched_pairs(
     elif chosen == "video":
         pairs = sfm_pairs.joined(*map(sfm_pairs.sequential_pairs, orders), alike(sfm_pairs.LOOP_NEIGHBOURS))
     elif chosen == "spatial":
+        if not np.isfinite(positions).all(axis=1).any():
+            raise NoPositionsError(
+                f"--matching spatial: none of the {len(ids):,} photos has a GPS position in its EXIF; expected "
+                "positions, or another choice such as --matching retrieval"
+            )
         apart = sfm_pairs.spatial_distances(positions)
         pairs = sfm_pairs.nearest_pairs(apart, sfm_pairs.NEAR_NEIGHBOURS)
         if not np.isfinite(positions).all():  # photographs without a position
