@@ -94,7 +94,7 @@ def test_the_still_life_stands_upright_on_its_floor(true: tuple[list[Any], Float
 def test_a_known_length_gives_metres_within_a_percent(
     true: tuple[list[Any], Float64], photos: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sfm, "_run_worker", lambda *_: pytest.fail("recovered again"))
+    monkeypatch.setattr(sfm, "run_worker", lambda *_: pytest.fail("recovered again"))
     metres = float(np.linalg.norm(true[1][0] - true[1][COUNT - 1]))
     loaded = reframed(photos, scene, None, f"view_00,view_{COUNT - 1}={metres!r}")
     assert against(loaded, true[1])[0] == pytest.approx(1, rel=0.01)
