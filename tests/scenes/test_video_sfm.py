@@ -138,6 +138,13 @@ def test_names_of_folders(given: str, reconstruction: str, frames: str) -> None:
     assert frames_folder(Path("b/scene")) == Path("b/scene_frames")
 
 
+def test_the_working_folder_as_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "scene" / "inner").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "scene" / "inner")
+    assert frames_folder(Path()) == tmp_path.resolve() / "scene" / "inner_frames"
+    assert frames_folder(Path("..")) == tmp_path.resolve() / "scene_frames"
+
+
 def test_layout_of_a_video_and_of_a_folder_of_videos(video: Path, tmp_path: Path) -> None:
     assert detect(video) == "photos"
     shutil.copy(video, tmp_path / "a.MP4")

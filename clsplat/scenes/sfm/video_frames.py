@@ -35,6 +35,8 @@ def reconstruction_folder(images: Path) -> Path:
 
 def frames_folder(output: Path) -> Path:
     """Return the folder for the frames of videos, beside the folder for their cameras."""
+    if output.name in ("", ".."):  # the working folder or the one above it, whose names are not in the path
+        output = output.resolve()
     return output.with_name(f"{output.name.removesuffix(RECONSTRUCTION_SUFFIX)}{FRAMES_SUFFIX}")
 
 
