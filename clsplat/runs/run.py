@@ -42,6 +42,7 @@ from clsplat.runs.settings import (
 )
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
 from clsplat.scenes.readers.scene_frame import frame_of_files
+from clsplat.scenes.sfm.video_frames import reconstruction_folder
 
 KEPT_CHECKPOINTS = 2
 """Number of latest checkpoints that a run keeps."""
@@ -142,16 +143,17 @@ class Run:
         if self.scene is None:
             return False
         own, other = self.scene.resolve(), path.resolve()
-        return other in (own, own.with_name(f"{own.name}_colmap"))
+        return other in (own, reconstruction_folder(own))
 
     def frame_for(self, path: Path) -> FrameUse | SceneFrame:
         """Return the frame in which the scene `path` fits the model: of the run's own scene, the model's frame.
 
-        Other scenes keep the frame of their files. Raises InputError for a damaged frame.json.
+        The scene's files may have been turned since the training. Other scenes keep the frame of their files. Raises
+        InputError for a damaged frame.json.
         """
         if not self.is_scene(path):
             return AS_IN_FILES
-        return self.frame or self.config.frame_use
+        return self.frame or SOURCE_FRAME
 
     def change_of(self, cameras: Path) -> Float64 | None:
         """Return the similarity (4, 4) from the frame of a scene's files to the model's.
@@ -159,9 +161,9 @@ class Run:
         cameras: the scene's folder or file. None if it is not the run's scene, or if the frames are equal. Raises
           InputError.
         """
-        if (frame := self.frame) is None or not self.is_scene(cameras):
+        if not self.is_scene(cameras):
             return None
-        return frame.change_from(frame_of_files(cameras) if cameras.is_dir() else SOURCE_FRAME)
+        return (self.frame or SOURCE_FRAME).change_from(frame_of_files(cameras) if cameras.is_dir() else SOURCE_FRAME)
 
     def keep_config(self, config: TrainConfig) -> None:
         """Write config.toml if the settings in `config` differ from the settings in the file."""

@@ -19,7 +19,9 @@ from clsplat.arrays import Float64
 from clsplat.config.depth import DepthUse
 from clsplat.config.orientation import FrameUse
 from clsplat.config.points import StartPoints
+from clsplat.config.training import TrainConfig
 from clsplat.images.geotags import GpsPosition
+from clsplat.runs.run import Run
 from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
@@ -206,6 +208,30 @@ def test_a_run_keeps_its_frame_when_the_scene_gets_another(result: Path) -> None
     later = load_scene(result, frame=trained.frame)
     np.testing.assert_allclose(later.points, trained.points, atol=1e-9)
     assert later.frame is trained.frame
+
+
+def test_a_run_without_a_frame_has_the_frame_that_the_cameras_had_first(result: Path, tmp_path: Path) -> None:
+    """A scene that is turned after a training still fits the model."""
+    before = load_scene(result)
+    run = Run.create(tmp_path / "run", TrainConfig(), scene=result)
+    run.keep_frame(before.frame)
+    assert run.change_of(result) is None
+    set_frame(result, result / "images", UP, result)
+    later = load_scene(result, frame=run.frame_for(result))
+    np.testing.assert_allclose(later.points, before.points, atol=1e-9)
+    change = run.change_of(result)
+    assert change is not None
+    np.testing.assert_allclose(change, np.linalg.inv(read_frame(result / MODEL_FOLDER).world_from_source), atol=1e-12)
+
+
+@pytest.mark.parametrize(("given", "made"), [("walk.mp4", "walk_colmap"), ("photos", "photos_colmap")])
+def test_the_cameras_recovered_for_a_run_are_its_scene(given: str, made: str, tmp_path: Path) -> None:
+    source = tmp_path / given
+    source.touch() if source.suffix else source.mkdir()
+    run = Run.create(tmp_path / "run", TrainConfig(), scene=source)
+    assert run.is_scene(source)
+    assert run.is_scene(tmp_path / made)
+    assert not run.is_scene(tmp_path / "walk.mp4_colmap")
 
 
 def test_the_same_bytes_twice(result: Path, tmp_path: Path) -> None:
