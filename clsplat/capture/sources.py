@@ -60,8 +60,8 @@ def check_sources(sources: Sequence[Path], output: Path, frames: int | None = No
             raise InputError(
                 f"{path}: is a file, expected a folder of photographs or a video ({' '.join(VIDEO_INPUT_SUFFIXES)})"
             )
-    if len({path.resolve() for path in sources}) < len(sources):
-        raise InputError(f"{sources[0]}: an input is given twice, expected each video once")
+    if twice := [path for at, path in enumerate(sources) if path.resolve() in {one.resolve() for one in sources[:at]}]:
+        raise InputError(f"{twice[0]}: an input is given twice, expected each video once")
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file, expected a folder for the results, or a new name")
 

@@ -199,7 +199,10 @@ def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool
             why = (
                 f"{examples(changed)} were removed or changed" if changed else "was made by another version of clsplat"
             )
-        raise InputError(f"{output}: {why}; give this folder in place of the video, remove it, or give --overwrite")
+        raise InputError(
+            f"{output}: {why}; give this folder in place of the video, remove it, or give --overwrite to clsplat sfm "
+            "or capture"
+        )
     return None
 
 
