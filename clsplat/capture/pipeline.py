@@ -132,7 +132,7 @@ def _show(folder: CaptureFolder, run: Run, plan: CapturePlan, device: Device, pr
         _write_report(folder, run, progress)
     with progress.stage("thumbnail"):
         folder.begin("thumbnail", source)
-        scene = load_scene(folder.scene, resolution=run.config.resolution)
+        scene = load_scene(folder.scene, resolution=run.config.resolution, frame=run.frame_for(folder.scene))
         up = np.array(COLMAP_UP) if scene.frame.upright else None
         pictures = ModelPictures(run, device, [view.camera for view in scene.views], plan.turntable_frames, up)
         if not folder.thumbnail.is_file():
