@@ -217,7 +217,8 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     """Return the scene of the views, with points and bounds for random points. Warns of outliers and missing points."""
     data = files.data
     cube = np.full(3, BLENDER_CUBE_HALF_SIDE)
-    name = path.resolve().name if path.is_dir() else path.resolve().parent.name
+    whole = path.resolve()
+    name = whole.name if path.is_dir() else whole.stem if kind == "photos" else whole.parent.name  # a video's own name
     scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
     scene.missing = tuple(data.missing)
     scene.frame, scene.world_from_files = files.frame, files.world_from_files

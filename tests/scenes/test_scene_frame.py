@@ -234,6 +234,14 @@ def test_the_cameras_recovered_for_a_run_are_its_scene(given: str, made: str, tm
     assert not run.is_scene(tmp_path / "walk.mp4_colmap")
 
 
+def test_the_scene_of_a_video_has_the_videos_name(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clsplat.scenes.loading.reconstruct", lambda *_, **__: folder)
+    (tmp_path / "walk.mp4").touch()
+    assert load_scene(tmp_path / "walk.mp4").name == "walk"
+
+
 def test_the_same_bytes_twice(result: Path, tmp_path: Path) -> None:
     import shutil
 

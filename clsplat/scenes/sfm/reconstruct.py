@@ -133,7 +133,7 @@ def reconstruct(
     Warns of copies, of which one is used, of photographs without a pose, in an unreadable format or without their
     alpha, and of focal lengths that differ from EXIF's. Raises InputError for a folder without photographs, a
     photograph that does not decode, an output that must not be replaced, and if the cameras cannot be recovered.
-    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain.
+    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for all frames of videos.
     """
     report = progress or no_progress
     settings.check()
