@@ -284,6 +284,10 @@ def test_known_lengths() -> None:
     odd = {"left, 1/a.jpg": cameras[NAMES[0]], "left, 1/b,c.jpg": cameras[NAMES[3]]}
     found = metres_per_unit(ScaleRule("photographs", 3.0, names="left, 1/a.jpg,b,c.jpg"), odd)
     assert found == pytest.approx(3 / length)
+    converted = {"in/a.heic.jpg": cameras[NAMES[0]], "in/b.dng.png": cameras[NAMES[3]], "in/b.c.jpg": cameras[NAMES[5]]}
+    for names in ("in/a.heic,b.dng", "a,b.dng.png", "a.heic.jpg,in/b.dng"):
+        assert metres_per_unit(ScaleRule("photographs", 3.0, names=names), converted) == pytest.approx(3 / length)
+    refuses("no photograph b;", metres_per_unit, ScaleRule("photographs", 3.0, names="a,b"), converted)  # of two
     assert metres_per_unit(ScaleRule("points", 5.0, (0, 0, 0, 0, 3, 4)), {}) == 1
     for names, match in (
         (f"{NAMES[0]},photo_17.jpg", "no photograph photo_17.jpg; did you mean photo_1"),

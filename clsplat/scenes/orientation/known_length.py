@@ -44,7 +44,7 @@ def _distance(ends: Float64, what: str) -> float:
 def _two_names(text: str, names: list[str]) -> tuple[str, str]:
     """Split a text at the comma that leaves a photograph's name on both sides. Names may have commas themselves.
 
-    A name without its folder or its extension is enough if it is unique.
+    A name without its folder or its extension is enough if it is unique. IMG.heic stands for its copy IMG.heic.jpg.
     """
     at = [index for index, character in enumerate(text) if character == ","]
     found = [(_matching(text[:comma], names), _matching(text[comma + 1 :], names)) for comma in at]
@@ -65,6 +65,13 @@ def _matching(text: str, names: list[str]) -> str | None:
     text = text.strip()
     if text in names:
         return text
-    by_name = [name for name in names if PurePosixPath(name).name == text]
-    same = by_name or [name for name in names if PurePosixPath(name).stem == text]
-    return same[0] if len(same) == 1 else None
+    paths = {name: PurePosixPath(name) for name in names}
+    for readings in (
+        {name: str(path.with_suffix("")) for name, path in paths.items()},
+        {name: path.name for name, path in paths.items()},
+        {name: path.stem for name, path in paths.items()},
+        {name: PurePosixPath(path.stem).stem for name, path in paths.items()},
+    ):
+        if same := [name for name, reading in readings.items() if reading == text]:
+            return same[0] if len(same) == 1 else None
+    return None
