@@ -19,6 +19,14 @@ def test_what_counts_as_transparent(dtype):
     assert sfm_photos._is_transparent(pixels, 3)
 
 
+def test_copies_of_converted_photographs_have_names_of_their_own(tmp_path):
+    for name in ("a.webp", "a.webp.jpg", "b.webp", "b.jpg", "c.webp"):
+        (tmp_path / name).write_bytes(b"")
+    used, left_out = sfm_photos.find_photos(tmp_path)
+    assert [path.name for path in used] == ["a.webp.jpg", "b.jpg", "b.webp", "c.webp"]
+    assert [path.name for path in left_out["their folder has the same photos in another format"]] == ["a.webp"]
+
+
 def test_camera_groups():
     photo = sfm_photos.Photo
     wide, tall = photo("a", "a", 40, 30, ()), photo("b", "b", 30, 40, ())

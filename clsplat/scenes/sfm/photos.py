@@ -107,18 +107,26 @@ def find_photos(
         unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
         raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
-    _, converted = without_converted([*photos, *lacking])
-    photos = [path for path in photos if path not in set(converted)]
+    converted = set(without_converted([*photos, *lacking])[1])
+    # also a photograph whose copy in the scene would have another photograph's name: a.webp beside a.webp.jpg
+    used = set(photos)
+    converted |= {path for path in photos if _is_converted(path) and path.with_name(f"{path.name}.jpg") in used}
+    photos = [path for path in photos if path not in converted]
     aside = companions(photos, photos, folder)
     kept = [path for path in photos if path not in aside]
     left_out = {
-        f"reading them needs another package: {PHOTOS_EXTRA}": [path for path in lacking if path not in set(converted)],
-        "their folder has the same photos in another format": converted,
+        f"reading them needs another package: {PHOTOS_EXTRA}": [path for path in lacking if path not in converted],
+        "their folder has the same photos in another format": list(converted),
         "convert to JPEG, PNG or TIFF first": others,
         "broken links": broken,
         "their names mark masks, depth maps or the like of other photos": aside,
     }
     return sorted(kept, key=key), {why: sorted(paths, key=key) for why, paths in left_out.items() if paths}
+
+
+def _is_converted(path: Path) -> bool:
+    """Return True if structure from motion uses a JPEG or PNG copy of a photograph, by its extension."""
+    return path.suffix.lower() in CONVERTED_PHOTO_EXTENSIONS
 
 
 def photo_name(folder: Path, path: Path) -> str:
