@@ -187,6 +187,24 @@ def test_times_of_a_variable_frame_rate(made: Walk, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, times / 1000, atol=1e-9)
 
 
+def test_times_go_on_in_files_that_were_joined(made: Walk, tmp_path: Path) -> None:
+    """As the parts of a long .mts recording, whose times begin anew."""
+    parts = []
+    for name, frames in (("a.mts", made.frames[:40]), ("b.mts", made.frames[40:])):
+        with av.open(str(tmp_path / name), "w", format="mpegts") as container:
+            stream = container.add_stream("libx264", rate=12)
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+            for picture in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame_planes(picture), format="yuv420p")))
+            container.mux(stream.encode(None))
+        parts.append((tmp_path / name).read_bytes())
+    (tmp_path / "walk.mts").write_bytes(b"".join(parts))
+    with open_video(tmp_path / "walk.mts") as reader:
+        found = [frame.seconds for frame in reader.frames()]
+    np.testing.assert_allclose(found, np.arange(COUNT) / 12, atol=1e-4)  # MPEG's clock has 90 kHz
+    assert len(take_frames([tmp_path / "walk.mts"], tmp_path / "frames", count=8).names) > 4
+
+
 @pytest.mark.needs("ffmpeg")
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_ffmpeg_turns_a_frame_the_same_way(turns: int, made: Walk, tmp_path: Path) -> None:

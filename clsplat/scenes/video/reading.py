@@ -113,7 +113,9 @@ class VideoReader:
         """Decode the frames in display order. Damaged packets are skipped, and `trouble` names them."""
         import av
 
-        first, index, last = None, 0, -1.0
+        first: float | None = None
+        last: float | None = None
+        index = 0
         packets = self._container.demux(self._stream)
         while True:
             try:
@@ -246,12 +248,19 @@ def _coding(context: Any) -> Coding:
     )
 
 
-def _seconds(raw: Any, last: float, stream: Any) -> float:
-    """Return a frame's time. A frame without a time follows the last one by the stream's frame duration."""
+def _seconds(raw: Any, last: float | None, stream: Any) -> float:
+    """Return a frame's time, which never falls.
+
+    A frame without a time, or with an earlier one, follows the last frame by the stream's frame duration. Times begin
+    anew in files that were joined, as cameras' .mts files often are.
+
+    last: time of the frame before; None for the first frame.
+    """
     if raw.pts is not None and raw.time_base is not None:
-        return float(raw.pts * raw.time_base)
-    rate = stream.average_rate or 25
-    return max(last, 0.0) + float(1 / Fraction(rate)) if last >= 0 else 0.0
+        at = float(raw.pts * raw.time_base)
+        if last is None or at >= last:
+            return at
+    return 0.0 if last is None else last + float(1 / Fraction(stream.average_rate or 25))
 
 
 def _quarter_turns(raw: Any) -> int:
