@@ -133,7 +133,8 @@ def test_pairs_of_a_video_are_neighbours_and_loops(database, tmp_path):
 def test_sequential_pairs_stay_in_their_video(database, tmp_path):
     videos = [[f"{at:02}.jpg" for at in range(start, start + 20)] for start in (0, 20)]
     _, found = matching.matched_pairs(tmp_path, "sequential", videos, 0)
-    wanted = [(one + start, two + start) for start in (1, 21) for one, two in pairs.sequential_pairs(range(20))]
+    # the last 20 are photographs beside the videos, in the order of their names
+    wanted = [(one + start, two + start) for start in (1, 21, 41) for one, two in pairs.sequential_pairs(range(20))]
     assert found == sorted(wanted)
     assert matching.matched_pairs(tmp_path, "sequential", [], 0)[1] == [
         (one + 1, two + 1) for one, two in pairs.sequential_pairs(range(60))

@@ -51,8 +51,8 @@ SFM_FEATURES = ("sift", "aliked")
 class SfmSettings:
     """Settings on which the recovered cameras depend.
 
-    matching: the pairs of photographs that are matched. "exhaustive": all. "sequential": neighbours in each video, or
-        in the order of names without videos. "spatial": the nearest by EXIF's GPS. "retrieval": the most similar by
+    matching: the pairs of photographs that are matched. "exhaustive": all. "sequential": neighbours in each video, and
+        outside videos in the order of names. "spatial": the nearest by EXIF's GPS. "retrieval": the most similar by
         their features. "auto": all of up to 40 photographs, else neighbours and similar photographs of videos, near
         photographs with GPS positions that differ enough, and similar photographs otherwise.
     camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or

@@ -45,7 +45,9 @@ def matched_pairs(
     if chosen == "exhaustive":
         pairs = sfm_pairs.all_pairs(len(ids))
     elif chosen == "sequential":
-        pairs = sfm_pairs.joined(*map(sfm_pairs.sequential_pairs, orders if any(orders) else [range(len(ids))]))
+        of_videos = {at for order in orders for at in order}
+        others = [at for at in range(len(ids)) if at not in of_videos]
+        pairs = sfm_pairs.joined(*map(sfm_pairs.sequential_pairs, [*orders, others]))
     elif chosen == "video":
         pairs = sfm_pairs.joined(*map(sfm_pairs.sequential_pairs, orders), alike(sfm_pairs.LOOP_NEIGHBOURS))
     elif chosen == "spatial":
