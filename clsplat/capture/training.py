@@ -12,7 +12,6 @@ from typing import Any
 
 from clsplat.api import train
 from clsplat.capture.progress import CaptureProgress
-from clsplat.config.orientation import AS_IN_FILES
 from clsplat.config.presets import scheduled
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
@@ -100,7 +99,7 @@ def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: Cap
         lenses=config.lenses,
         missing=config.missing,
         progress=progress,
-        frame=AS_IN_FILES if earlier is None or earlier.frame is None else earlier.frame,
+        frame=config.frame_use if earlier is None else earlier.frame_to_resume(),
     )
     scene = prepared(scene, config, earlier)
     scene.check_pictures()

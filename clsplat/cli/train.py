@@ -327,7 +327,7 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
         config.mask_use,
         config.lenses,
         config.missing,
-        (earlier.frame if earlier is not None else None) or config.frame_use,
+        config.frame_use if earlier is None else earlier.frame_to_resume(),
     )
     scene = prepared(scene, config, earlier)
     _check_scene(scene)

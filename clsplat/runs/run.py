@@ -155,6 +155,13 @@ class Run:
             return AS_IN_FILES
         return self.frame or SOURCE_FRAME
 
+    def frame_to_resume(self) -> FrameUse | SceneFrame:
+        """Return the frame in which a training goes on: the model's, or before the first checkpoint the settings'.
+
+        Raises InputError for a damaged frame.json.
+        """
+        return self.frame or (SOURCE_FRAME if self.checkpoints() else self.config.frame_use)
+
     def change_of(self, cameras: Path) -> Float64 | None:
         """Return the similarity (4, 4) from the frame of a scene's files to the model's.
 

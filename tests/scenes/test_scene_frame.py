@@ -216,9 +216,11 @@ def test_a_run_without_a_frame_has_the_frame_that_the_cameras_had_first(result: 
     run = Run.create(tmp_path / "run", TrainConfig(), scene=result)
     run.keep_frame(before.frame)
     assert run.change_of(result) is None
+    (run.path / "checkpoints").mkdir(exist_ok=True)
+    (run.path / "checkpoints" / "step-10.npz").touch()
     set_frame(result, result / "images", UP, result)
-    later = load_scene(result, frame=run.frame_for(result))
-    np.testing.assert_allclose(later.points, before.points, atol=1e-9)
+    for frame in (run.frame_for(result), run.frame_to_resume()):
+        np.testing.assert_allclose(load_scene(result, frame=frame).points, before.points, atol=1e-9)
     change = run.change_of(result)
     assert change is not None
     np.testing.assert_allclose(change, np.linalg.inv(read_frame(result / MODEL_FOLDER).world_from_source), atol=1e-12)
