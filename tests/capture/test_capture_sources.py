@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from clsplat.capture.folder import CaptureFolder
 from clsplat.capture.sources import check_sources, photographs_of
 from clsplat.images.writing import write_image
 from clsplat.progress import no_progress
-from clsplat.scenes.sfm.photos import Photo, camera_groups
+from clsplat.scenes.sfm.photos import Photo, camera_groups, fingerprint
 from clsplat.scenes.sfm.video_frames import frames_of_videos
 
 require("av")
@@ -47,6 +48,16 @@ def test_a_video(videos: Path, tmp_path: Path) -> None:
     found = photographs_of([videos / "a" / "walk.mp4"], folder, 5, no_progress)
     assert (found.path, found.count, found.frames_to) == (folder.frames, 5, None)
     assert len(list(folder.frames.glob("walk.mp4/*.jpg"))) == 5
+
+
+def test_frames_that_are_taken_again_are_the_same_photographs(videos: Path, tmp_path: Path) -> None:
+    """So that their cameras are used again, as of a capture whose frames/ was removed to save room."""
+    folder, found = CaptureFolder(tmp_path), []
+    for _ in range(2):
+        photographs_of([videos / "a" / "walk.mp4"], folder, 4, no_progress)
+        found.append(fingerprint(folder.frames, sorted(folder.frames.rglob("*.jpg")), ""))
+        shutil.rmtree(folder.frames)
+    assert found[0] == found[1]
 
 
 def test_several_videos_have_folders_below_their_common_one(videos: Path, tmp_path: Path) -> None:

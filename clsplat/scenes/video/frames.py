@@ -81,8 +81,8 @@ def take_frames(
     """Choose frames of videos, and write them as photographs to the folder `output`.
 
     A frame's name is that of its video's file, followed by the number of the frame: walk.mp4/000123.jpg. The frames are
-    upright and in the space of photographs. The same videos give the same bytes again. An existing folder with the
-    frames of the same videos and the same `count` is used again.
+    upright and in the space of photographs. The same video gives the same bytes and modification times, which are the
+    video's. An existing folder with the frames of the same videos and the same `count` is used again.
 
     Each video is decoded twice: once for the choice, which depends on the whole video, and once for the chosen frames.
 
@@ -229,6 +229,9 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
     (folder / name).mkdir(parents=True)
     with open_video(path) as reader:
         _write(reader, facts, folder, files, turns, lambda done: progress(f"writing the frames of {name}", done))
+    changed = path.stat().st_mtime_ns
+    for file in files.values():  # so that frames that are taken again count as the same photographs
+        os.utime(folder / file, ns=(changed, changed))
     return {**_described(facts, turns), **_listed(folder, files, measured, choice, numbers), **_told(told)}
 
 
