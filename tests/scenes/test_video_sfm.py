@@ -46,9 +46,10 @@ def tasks(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         shutil.copytree(task["photos"], work / "result" / "images")
         (work / "result" / "sparse" / "0").mkdir(parents=True)
         (work / "result" / "sparse" / "0" / "images.bin").write_bytes(b"")
-        return {"result": {"registered": names}}
+        return {"result": {"registered": names, "fragments": []}}
 
-    monkeypatch.setattr(sfm, "_run_worker", run)
+    monkeypatch.setattr(sfm, "run_worker", run)
+    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
     return given
 
 
