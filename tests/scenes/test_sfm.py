@@ -188,6 +188,7 @@ def test_a_smaller_model_is_named(photos, tmp_path, monkeypatch):
         return {"result": {"registered": names[:7], "fragments": [names[7:10], names[10:11]]}}
 
     monkeypatch.setattr(sfm, "run_worker", run)
+    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
     apart = "form a model of their own, with too few matches to the 7 photo(s) that are used; to join both, add photos"
     messages = warnings_of(lambda: sfm.reconstruct(photos, tmp_path / "out"))
     assert [message.split(": ", 1)[1] for message in messages] == [
@@ -220,8 +221,8 @@ def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threa
     monkeypatch.setattr(worker.matching.sfm_database, "image_names", lambda _: {})
     monkeypatch.setattr(worker.matching.sfm_database, "rename_images", lambda *_: None)
     settings = sfm.SfmSettings(mapper=mapper)
-    photos = [sfm_photos.Photo(name, 40, 30, ()) for name in names]
-    work = worker.Worker(sfm.sfm_task(settings, photos, [], tmp_path, 3), io.StringIO())
+    photos = [sfm_photos.Photo(name, name, 40, 30, ()) for name in names]
+    work = worker.Worker(sfm.sfm_task(settings, photos, [], [], tmp_path, 3), io.StringIO())
     work.match()
     work.map()
     assert {options.num_threads for options in given if hasattr(options, "num_threads")} == {threads}

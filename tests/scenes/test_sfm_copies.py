@@ -54,6 +54,7 @@ def used(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], tuple[list[str], l
         return {"result": {"registered": registered, "fragments": []}}
 
     monkeypatch.setattr(sfm, "run_worker", run)
+    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
     monkeypatch.setattr(sfm, "_without_their_alpha", lambda *_: [])
 
     def work(folder: Path) -> tuple[list[str], list[str]]:

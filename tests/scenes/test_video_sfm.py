@@ -49,7 +49,7 @@ def tasks(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         return {"result": {"registered": names, "fragments": []}}
 
     monkeypatch.setattr(sfm, "run_worker", run)
-    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)  # the model is not one
+    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
     return given
 
 
