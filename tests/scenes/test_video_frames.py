@@ -23,6 +23,7 @@ from walk_videos import Walk, sliding, walk, write_walk
 from clsplat.config.pictures import VideoConfig
 from clsplat.images.video import frame_planes, prores_planes, video_writer
 from clsplat.scenes.video.choice import choose
+from clsplat.scenes.video.colours import display_rgb
 from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, measure_video, take_frames
 from clsplat.scenes.video.reading import open_video, parse_place
 
@@ -153,6 +154,22 @@ def test_other_codecs_of_ten_frames(name: str, codec: str, form: str, tmp_path: 
             wanted = np.repeat((wanted @ [0.299, 0.587, 0.114])[:, :, None], 3, axis=2)
         # default qualities of the codecs, and chroma of half size
         assert np.corrcoef(pixels.ravel(), wanted.ravel())[0, 1] > 0.93
+
+
+@pytest.mark.parametrize("height", [72, 720])
+@pytest.mark.parametrize(("name", "codec", "form"), [("a.mkv", "libx264rgb", "rgb24"), ("a.mov", "png", "rgb24")])
+def test_rgb_keeps_its_colours_at_any_size(name: str, codec: str, form: str, height: int, tmp_path: Path) -> None:
+    """FFmpeg converts RGB by Rec.601, also where Rec.709 would be assumed of a video without a matrix."""
+    picture = np.full((height, 128, 3), (200, 60, 30), np.uint8)
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream(codec, rate=10, options={"qp": "0"} if codec == "libx264rgb" else {})
+        stream.width, stream.height, stream.pix_fmt = 128, height, form
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+    with open_video(tmp_path / name) as reader:
+        (found,) = [display_rgb(frame.planes(), reader.facts.coding) for frame in reader.frames()]
+    # rounding of 8-bit values of limited range
+    assert np.abs(found[8:-8, 8:-8].astype(int) - picture[8:-8, 8:-8]).max() <= 3
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov"])

@@ -35,6 +35,8 @@ _PLACE_KEYS = ("com.apple.quicktime.location.ISO6709", "location", "location-eng
 _TIME_KEYS = ("com.apple.quicktime.creationdate", "creation_time", "date")
 _MAKE_KEYS = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
 _MODEL_KEYS = ("com.apple.quicktime.model", "com.android.model", "model")
+_RGB = re.compile(r"gbr|[a0x]?(rgb|bgr)|pal8")
+"""Beginnings of FFmpeg's names of pixel formats of RGB."""
 _PLANAR = re.compile(r"yuvj?(420|422|444)p(?:(10|12|16)le)?\Z")
 
 
@@ -238,7 +240,9 @@ def _coding(context: Any) -> Coding:
     """Return how a stream's pixels are coded, by the numbers of ISO/IEC 23091-2 (H.273) in its header."""
     form = context.pix_fmt or ""
     matrix = int(context.colorspace or 2)
-    if matrix in (0, 2, 3):  # RGB, unknown, reserved
+    if _RGB.match(form):
+        matrix = 6  # by which FFmpeg converts RGB in `_planes`
+    elif matrix in (0, 2, 3):  # RGB, unknown, reserved
         matrix = 6 if min(context.width, context.height) <= SD_HEIGHT_PX else 1
     return Coding(
         matrix=matrix,
