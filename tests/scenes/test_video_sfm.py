@@ -145,6 +145,15 @@ def test_the_working_folder_as_output(tmp_path: Path, monkeypatch: pytest.Monkey
     assert frames_folder(Path("..")) == tmp_path.resolve() / "scene_frames"
 
 
+@pytest.mark.parametrize("extension", ["HEIC", "jpg", "JPEG", "dng", "gif"])
+def test_the_videos_of_moving_photographs_are_left_out(extension: str, tmp_path: Path) -> None:
+    for name in (f"IMG_1.{extension}", "IMG_1.MOV", "walk.mov"):
+        (tmp_path / name).touch()
+    videos, left_out = find_videos(tmp_path)
+    assert videos == [tmp_path / "walk.mov"]
+    assert list(left_out.values()) == [[tmp_path / "IMG_1.MOV"]]
+
+
 def test_layout_of_a_video_and_of_a_folder_of_videos(video: Path, tmp_path: Path) -> None:
     assert detect(video) == "photos"
     shutil.copy(video, tmp_path / "a.MP4")

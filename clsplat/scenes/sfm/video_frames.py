@@ -13,6 +13,7 @@ from clsplat.files.documents import digest
 from clsplat.images.reading import cannot_be_searched
 from clsplat.progress import Progress
 from clsplat.scenes.sfm.photos import (
+    CONVERTED_PHOTO_EXTENSIONS,
     SFM_PHOTO_EXTENSIONS,
     UNREADABLE_PHOTO_EXTENSIONS,
     Photo,
@@ -143,7 +144,7 @@ def find_videos(folder: Path, excluded: Collection[Path] = ()) -> tuple[list[Pat
     for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
         here = Path(parent)
         folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
-        kinds = SFM_PHOTO_EXTENSIONS | UNREADABLE_PHOTO_EXTENSIONS
+        kinds = SFM_PHOTO_EXTENSIONS | CONVERTED_PHOTO_EXTENSIONS | UNREADABLE_PHOTO_EXTENSIONS
         stills = {Path(name).stem.casefold() for name in files if Path(name).suffix.lower() in kinds}
         for name in files:
             if not name.startswith(".") and is_video_name(Path(name)):
