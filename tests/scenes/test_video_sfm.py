@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,22 @@ def test_videos_and_photographs_in_one_folder_are_several_cameras(
     assert len(tasks) == 1
 
 
+def test_without_pyav_videos_beside_photographs_are_left_out(
+    tmp_path: Path, tasks: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    folder = tmp_path / "in"
+    (folder / "more").mkdir(parents=True)
+    (folder / "more" / "walk.mp4").touch()
+    refuses(r"walk\.mp4: video needs PyAV", sfm.reconstruct, folder, tmp_path / "scene")
+    for index in (10, 14, 18):
+        write_pixels(folder / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
+    refuses(r"walk\.mp4: video needs PyAV", sfm.reconstruct, folder, tmp_path / "scene", frames=5)
+    (message,) = warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "scene"))
+    assert "1 video(s) (more/walk.mp4) left out: video needs PyAV, which is not installed: pip install" in message
+    assert names_of(tasks[0]) == ["10.png", "14.png", "18.png"]
+
+
 def test_a_folder_of_frames_keeps_their_order(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
     taken = take_frames([video], tmp_path / "frames", count=6)
     (tmp_path / "frames" / taken.names[1]).unlink()
@@ -143,6 +160,10 @@ def test_the_working_folder_as_output(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path / "scene" / "inner")
     assert frames_folder(Path()) == tmp_path.resolve() / "scene" / "inner_frames"
     assert frames_folder(Path("..")) == tmp_path.resolve() / "scene_frames"
+    (tmp_path / "in").mkdir()
+    for index in range(3):
+        write_pixels(tmp_path / "in" / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
+    refuses(r"^\.: is the working folder or one above", sfm.reconstruct, tmp_path / "in", Path())
 
 
 @pytest.mark.parametrize("extension", ["HEIC", "jpg", "JPEG", "dng", "gif"])

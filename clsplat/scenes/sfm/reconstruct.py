@@ -384,6 +384,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
     except InputError:
         if any(output.iterdir()):
             raise InputError(f"{output}: is neither empty nor a result of sfm, expected a new folder") from None
+        _check_replaceable(output)
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
     files = record.get("files")
@@ -402,7 +403,16 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
             f"{output}: its cameras were recovered with other settings or from other photos than those now in "
             f"{images}; remove it or choose another folder"
         )
+    _check_replaceable(output)
     return False
+
+
+def _check_replaceable(output: Path) -> None:
+    """Raise InputError for an output such as . or .., which no system replaces by the finished folder."""
+    if output.name in ("", ".."):
+        raise InputError(
+            f"{output}: is the working folder or one above, which cannot be replaced; give the name of a new folder"
+        )
 
 
 def _sizes(result: Path) -> dict[str, int]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from clsplat.errors import InputError
 from clsplat.files.documents import digest
 from clsplat.images.reading import cannot_be_searched
+from clsplat.images.video import video_missing
 from clsplat.progress import Progress
 from clsplat.scenes.sfm.photos import (
     CONVERTED_PHOTO_EXTENSIONS,
@@ -103,6 +104,7 @@ def frames_of_videos(
 
     output: folder for the cameras. count, overwrite: as for `take_frames`.
     folder: folder for the frames; by default `frames_folder(output)`.
+    Without PyAV, videos beside photographs are left out, unless frames are asked for by `count`.
     Raises InputError for a file that is not a video, and if `take_frames` does.
     """
     folder = folder or frames_folder(output)
@@ -120,6 +122,9 @@ def frames_of_videos(
         if count is not None:
             raise InputError(f"--frames {count}: {images} has no videos, expected one")
         return VideoFrames(folder, sequences=frame_sequences(images), left_out=parts)
+    why = video_missing() if count is None and images.is_dir() else ""
+    if why and find_photos(images, (output, folder), needed=False)[0]:
+        return VideoFrames(folder, left_out={**parts, why: videos})
     taken = take_frames(
         videos,
         folder,
