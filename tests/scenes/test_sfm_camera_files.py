@@ -137,7 +137,7 @@ def test_focal_lengths_of_exif_are_those_with_which_pycolmap_begins(tmp_path):
     for name, exif in (("a.jpg", exif_bytes(1, 5, 26)), ("b.jpg", exif_bytes(1, 5, 26)), ("c.jpg", b"")):
         Pillow.fromarray(noise).save(photos / name, exif=exif)
     task = {"photos": photos, "work": tmp_path, "groups": [["a.jpg", "b.jpg"], ["c.jpg"]], "threads": 2, "masks": []}
-    task |= {"max_image_size": 1600, "max_features": 100, "camera_model": "auto", "seed": 0}
+    task |= {"max_image_size": 1600, "max_features": 100, "camera_model": "auto", "seed": 0, "features": "sift"}
     work = worker.Worker(task, io.StringIO())
     work.extract()
     worker.renumber_by_name(work.database)

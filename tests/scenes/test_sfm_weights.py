@@ -156,6 +156,7 @@ def test_a_scene_without_learned_weights_is_one_of_sift(noise, silent, tmp_path,
         return {"result": {"registered": [f"{index}.png" for index in range(COUNT)], "fragments": []}}
 
     monkeypatch.setattr(sfm, "run_worker", run)
+    monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
     (message,) = warnings_of(lambda: sfm.reconstruct(noise, tmp_path / "scene", LEARNED))
     assert "SIFT features are used instead" in message
     assert (tasks[0]["features"], tasks[0]["weights"]) == ("sift", "")
