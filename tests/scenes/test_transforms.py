@@ -125,7 +125,7 @@ def test_habits_of_file_path(tmp_path: Path, listed: str, name: str) -> None:
         ({}, {"file_path": None}, "frame 1: has no 'file_path'"),
         ({}, {"file_path": 7}, "frame 1: 'file_path' is 7, expected text"),
         ({}, {"transform_matrix": None}, "frame 1: has no 'transform_matrix'"),
-        ({}, {"transform_matrix": [[1], 2]}, r"frame 1: 'transform_matrix' is \[\[1\], 2\], expected 4 x 4"),
+        ({}, {"transform_matrix": [[1], 2]}, r"frame 1: 'transform_matrix' is \[\[1\], 2\], expected 3 x 4"),
         ({}, {"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "contains no rotation"),
         ({}, {"transform_matrix": np.transpose(POSE).tolist()}, "frame 1: .* has the last row .*, so transpose it"),
         ({}, {"file_path": "images/0.png"}, "lists images/0.png twice"),

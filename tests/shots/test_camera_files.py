@@ -84,7 +84,7 @@ def test_camera_path_of_other_cameras(tmp_path: Path) -> None:
         ({"render_width": None}, "has no 'render_width', expected a whole number of pixels"),
         ({"render_height": 10.5}, "'render_height' is 10.5, expected a whole number of pixels"),
         ({"camera_path": [{"fov": 50}]}, "key 0: has no 'camera_to_world'"),
-        ({"camera_path": [{"camera_to_world": [1, 2]}]}, "key 0: 'camera_to_world' is [1, 2], expected 4 x 4"),
+        ({"camera_path": [{"camera_to_world": [1, 2]}]}, "key 0: 'camera_to_world' is [1, 2], expected 3 x 4"),
         ({"camera_path": [{"camera_to_world": [0] * 16}]}, "key 0: 'camera_to_world' contains no rotation"),
         (
             {"camera_path": [{"camera_to_world": np.transpose(POSE).ravel().tolist(), "fov": 50}]},

@@ -15,6 +15,7 @@ from clsplat.cli import main as command_line
 from clsplat.cli.session import Services
 from clsplat.config.depth import NO_DEPTH, DepthUse
 from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.config.orientation import AS_IN_FILES
 from clsplat.config.points import StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig
@@ -149,9 +150,10 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         masks: MaskUse,
         lenses: str,
         missing: str,
+        frame: object,
         progress: Callable[..., None],
     ) -> Any:
-        assert (masks, lenses, missing) == (NO_MASKS, "undistort", "few")
+        assert (masks, lenses, missing, frame) == (NO_MASKS, "undistort", "few", AS_IN_FILES)
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")
         pipe.calls.append(("load_scene", str(path), resolution, test_every))

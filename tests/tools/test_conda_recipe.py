@@ -40,8 +40,8 @@ def test_the_recipe_has_the_requirements_of_the_wheel_on_every_system() -> None:
 
 
 def test_a_requirement_that_differs_is_told_by_system(tmp_path: Path) -> None:
-    path = spoilt(tmp_path, "pycolmap >=4.0", "pycolmap >=3.0")
-    message = "pycolmap has '>=3.0', expected '>=4.0' as in pyproject.toml"
+    path = spoilt(tmp_path, "pycolmap >=4.1.1", "pycolmap >=3.0")
+    message = "pycolmap has '>=3.0', expected '>=4.1.1' as in pyproject.toml"
     assert conda_recipe.problems(path, ROOT) == [f"recipe.yaml, {system}: {message}" for system in conda_recipe.SYSTEMS]
     path = spoilt(tmp_path, ", intel-opencl-rt >=2024.2", "")
     message = "intel-opencl-rt has nothing, expected '>=2024.2' as in pyproject.toml"
