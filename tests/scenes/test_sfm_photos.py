@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.reconstruct import SfmSettings
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -35,3 +36,9 @@ def test_camera_groups():
     assert sfm_photos.camera_groups(everything, "auto") == [["a", "d"], ["b"], ["c"]]
     assert sfm_photos.camera_groups(everything, True) == [["a", "c", "d"], ["b"]]
     assert sfm_photos.camera_groups(everything, False) == [["a"], ["b"], ["c"], ["d"]]
+
+
+def test_settings_of_earlier_versions_keep_their_text():
+    """Otherwise `sfm` and `train` would refuse the cameras that an earlier version has recovered."""
+    assert str(SfmSettings()) == "auto auto auto 1600 8192 0"
+    assert str(SfmSettings(mapper="global")) != str(SfmSettings()) != str(SfmSettings(features="aliked"))

@@ -95,10 +95,14 @@ class SfmSettings:
         self.frame.check()
 
     def __str__(self) -> str:
-        """Return the values of the settings in one line, for the fingerprint of a result."""
+        """Return the values of the settings in one line, for the fingerprint of a result.
+
+        Mapper and features are left out by default, so that results of versions without these choices are reused.
+        """
         lens = f"{self.camera_model} {self.shared_camera}"
-        stages = f"{self.features} {self.matching} {self.mapper}"
-        return f"{stages} {lens} {self.max_image_size} {self.max_features} {self.seed}"
+        chosen = (self.mapper, self.features)
+        more = "" if chosen == ("auto", "sift") else f" {self.mapper} {self.features}"
+        return f"{self.matching} {lens} {self.max_image_size} {self.max_features} {self.seed}{more}"
 
 
 DEFAULT_SFM_SETTINGS = SfmSettings()
