@@ -60,6 +60,8 @@ def check_sources(sources: Sequence[Path], output: Path, frames: int | None = No
             raise InputError(
                 f"{path}: is a file, expected a folder of photographs or a video ({' '.join(VIDEO_INPUT_SUFFIXES)})"
             )
+    if len({path.absolute().anchor for path in sources}) > 1:
+        raise InputError("the videos are on several drives, expected one; copy them into one folder, and give that")
     if twice := [path for at, path in enumerate(sources) if path.resolve() in {one.resolve() for one in sources[:at]}]:
         raise InputError(f"{twice[0]}: an input is given twice, expected each video once")
     if output.exists() and not output.is_dir():
