@@ -23,7 +23,7 @@ compressed."""
 HDR_PEAK_NITS = 1000.0
 """Luminance in cd/m^2 that becomes white, as all brighter values do: HLG's nominal peak in BT.2100."""
 HIGHLIGHT_KNEE = 0.6
-"""Linear value up to which light stays unchanged. Values from it to the peak are compressed to the range up to 1."""
+"""Linear value up to which light stays unchanged. Higher values, up to the peak, are compressed to the range below 1."""
 HLG_SYSTEM_GAMMA = 1.2
 """Exponent of HLG's opto-optical transfer function for a display of 1000 cd/m^2 (BT.2100, table 5)."""
 SDR_DISPLAY_GAMMA = 2.4
