@@ -228,7 +228,9 @@ class BlockSpectra:
 
 
 def _vertex(left: Float32, middle: Float32, right: Float32) -> Float64:
-    """Return the offset in pixels from `middle` to the peak of a Gaussian through three neighbouring values; 0 for none.
+    """Return the offset in pixels from `middle` to the peak of a Gaussian through three neighbouring values.
+
+    It is 0 if the values have no peak.
 
     The correlation of two shifted blocks is a Gaussian, because its frequencies have Gaussian weights.
     """
