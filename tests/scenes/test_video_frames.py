@@ -261,7 +261,7 @@ def sound(path: Path) -> None:
     [
         (lambda path, whole: path.unlink(), "no such file, expected a video"),
         (lambda path, whole: (path.unlink(), path.mkdir()), "is a folder, expected a video"),
-        (lambda path, whole: path.write_bytes(b""), r"cannot be read as a video \(.*\), expected a whole file"),
+        (lambda path, whole: path.write_bytes(b""), r"cannot be read as a video \(.*\), expected a complete file"),
         (lambda path, whole: path.write_text("hello\n" * 99), r"cannot be read as a video \(Invalid data"),
         (lambda path, whole: path.write_bytes(cut(whole)), r"cannot be read as a video \(Invalid data"),
         (

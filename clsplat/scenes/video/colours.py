@@ -23,7 +23,7 @@ compressed."""
 HDR_PEAK_NITS = 1000.0
 """Luminance in cd/m^2 that becomes white, as all brighter values do: HLG's nominal peak in BT.2100."""
 HIGHLIGHT_KNEE = 0.6
-"""Linear value up to which light stays unchanged. Higher values, up to the peak, are compressed to the range below 1."""
+"""Linear value up to which light stays unchanged. Higher values, up to the peak, are compressed to 1 at most."""
 HLG_SYSTEM_GAMMA = 1.2
 """Exponent of HLG's opto-optical transfer function for a display of 1000 cd/m^2 (BT.2100, table 5)."""
 SDR_DISPLAY_GAMMA = 2.4
@@ -39,8 +39,8 @@ LUMA_WEIGHTS_BY_MATRIX = {
     9: (0.2627, 0.6780, 0.0593),
     10: (0.2627, 0.6780, 0.0593),
 }
-"""Weights of red, green and blue in luma, by the number of the matrix in H.273: Rec.709, FCC, Rec.601 twice, SMPTE 240M and
-BT.2020 twice."""
+"""Weights of red, green and blue in luma, by the number of the matrix in H.273: Rec.709, FCC, Rec.601 twice, SMPTE
+240M and BT.2020 twice."""
 _REC2020_TO_REC709 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]], np.float32
 )

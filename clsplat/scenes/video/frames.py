@@ -82,8 +82,8 @@ def take_frames(
     """Choose frames of videos, and write them as photographs to the folder `output`.
 
     A frame's name is that of its video's file, followed by the number of the frame: walk.mp4/000123.jpg. The frames are
-    upright, with the colours of photographs (`display_rgb`). The same videos give the same bytes again. An existing folder with the
-    frames of the same videos and the same `count` is used again.
+    upright, with the colours of photographs (`display_rgb`). The same videos give the same bytes again. An existing
+    folder with the frames of the same videos and the same `count` is used again.
 
     Each video is decoded twice: once for the choice, which depends on the whole video, and once for the chosen frames.
 
@@ -222,7 +222,7 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
     choice = choose(measured, count)
     if not len(choice.frames):
         raise InputError(
-            f"{path}: each of its {len(measured):,} frames is blurred, damaged or of a fast turn, expected a slower camera"
+            f"{path}: each of its {len(measured):,} frames is blurred, damaged or of a fast camera, expected a slower one"
         )
     told = preview(facts, measured, choice)
     progress(f"{name}: {told.text}", None)

@@ -24,7 +24,7 @@ VIDEO_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
 """FFmpeg's names of the containers that are read. Playlists are not among them, because they name other files or
 network addresses."""
 SD_HEIGHT_PX = 576
-"""Largest shorter side in pixels of a video whose luma matrix is assumed to be Rec.601 if the file names none."""
+"""Shorter side in pixels up to which a video's luma matrix is taken as Rec.601 if the file does not name one."""
 MIN_VIDEO_SIDE_PX = 32
 """Smallest side in pixels of a video whose motion can be measured."""
 MAX_VIDEO_PIXELS = 1 << 27
@@ -93,7 +93,7 @@ class VideoFrame:
     raw: Any
 
     def planes(self) -> Planes:
-        """Return luma and chroma as stored, as views of the decoder's memory. They are valid as long as this frame exists."""
+        """Return luma and chroma as stored, as views of the decoder's memory. They are valid while this frame exists."""
         return _planes(self.raw)
 
     def luma(self) -> np.ndarray[Any, Any]:
@@ -157,7 +157,7 @@ def open_video(path: Path) -> Iterator[VideoReader]:
             container = av.open(file, metadata_errors="replace", options={"format_whitelist": VIDEO_CONTAINERS})
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise InputError(
-                f"{path}: cannot be read as a video ({_reason(error)}), expected a complete file of one of the kinds {kinds}"
+                f"{path}: cannot be read as a video ({_reason(error)}), expected a complete file of a kind in {kinds}"
             ) from None
         with container:
             streams = [stream for stream in container.streams.video if not _is_cover(stream)]
