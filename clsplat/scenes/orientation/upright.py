@@ -69,7 +69,7 @@ class Upright:
     plane: LevelPlane | None
 
     def motion(self, ahead: Float64 | None = None) -> Float64:
-        """Return the rigid motion (4, 4) to the upright frame. ahead: (3,), used instead of `self.ahead`, such as north."""
+        """Return the rigid motion (4, 4) to the upright frame. ahead: (3,), such as north; None for `self.ahead`."""
         rotation = axes_of(self.up, self.ahead if ahead is None else ahead)
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = rotation, -rotation @ self.origin
@@ -120,7 +120,7 @@ def axes_of(up: Float64, ahead: Float64) -> Float64:
 
 
 def _heading(camera: Camera, up: Float64) -> Float64:
-    """Return a camera's heading (3,): the horizontal part of its view direction, or in a steep view its y axis.
+    """Return a camera's heading (3,): the horizontal part of its view direction, or a direction along its y axis if the view is steep.
 
     For a view straight down, the top of the picture points to the heading.
     """
@@ -132,7 +132,7 @@ def _heading(camera: Camera, up: Float64) -> Float64:
 
 
 def _prior(cameras: Sequence[Camera]) -> tuple[Float64, float, str]:
-    """Return the cameras' up direction (3,), the largest angle of a plane from it in radians, and its name for notes."""
+    """Return the cameras' up direction (3,), the largest tilt of a plane from it in radians, and its name for notes."""
     if looks_down(cameras):
         forward = np.mean([camera.rotation[2] for camera in cameras], axis=0)
         return -forward / np.linalg.norm(forward), MAX_PLANE_TILT_BELOW_RADIANS, "the cameras, which all look down"
