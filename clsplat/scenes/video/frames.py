@@ -222,7 +222,8 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
     choice = choose(measured, count)
     if not len(choice.frames):
         raise InputError(
-            f"{path}: each of its {len(measured):,} frames is blurred, damaged or of a fast camera, expected a slower one"
+            f"{path}: all of its {len(measured):,} frames are blurred, damaged or of a fast camera, expected a slower "
+            "camera"
         )
     told = preview(facts, measured, choice)
     progress(f"{name}: {told.text}", None)
