@@ -93,7 +93,7 @@ class VideoFrame:
     raw: Any
 
     def planes(self) -> Planes:
-        """Return luma and chroma as stored, as views of the decoder's memory. They are valid while this frame exists."""
+        """Return luma and chroma as stored: views of the decoder's memory, which are valid while this frame exists."""
         return _planes(self.raw)
 
     def luma(self) -> np.ndarray[Any, Any]:
