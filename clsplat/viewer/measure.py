@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance between two clicked points of the model, and the flags that set the scale by it. Uses neither OpenCL nor viser.
+"""Distance between two clicked points of the model, and the flags that set the scale by it.
+
+The module uses neither OpenCL nor viser.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from clsplat.errors import InputError
 MIN_CLICK_ALPHA = 0.5
 """Minimum alpha of a pixel on which a click hits the model."""
 CLICK_WINDOW_PX = 3
-"""Number of pixels on each side of a click to which a plane is fitted, because all pixels of a Gaussian have one depth."""
+"""Number of pixels on each side of a click to which a plane is fitted. One depth is not enough, because all pixels of a
+Gaussian have the same."""
 SAME_SURFACE_RATIO = 0.1
 """Largest difference from the clicked depth, relative to it, of depths that can be on the same surface."""
 SURFACE_FITS = 5
