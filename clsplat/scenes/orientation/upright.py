@@ -120,9 +120,10 @@ def axes_of(up: Float64, ahead: Float64) -> Float64:
 
 
 def _heading(camera: Camera, up: Float64) -> Float64:
-    """Return a camera's heading (3,): the horizontal part of its view direction, or a direction along its y axis if the view is steep.
+    """Return a camera's heading (3,): the horizontal part of its view direction.
 
-    For a view straight down, the top of the picture points to the heading.
+    If the view is steep, the heading is along the camera's y axis. In a view straight down, the top of the picture is
+    ahead.
     """
     ahead = camera.rotation[2]
     level = ahead - (ahead @ up) * up
