@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input of a capture: a folder with photographs, videos or both, or video files. Frames of videos become photographs."""
+"""Input of a capture: a folder with photographs, videos or both, or else video files."""
 
 from __future__ import annotations
 
