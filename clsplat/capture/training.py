@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training stage of a capture. Settings are adapted to the scene, and a training continues after an interruption."""
+"""The training stage of a capture. It adapts settings to the scene, and continues an interrupted training."""
 
 from __future__ import annotations
 
