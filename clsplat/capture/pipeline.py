@@ -73,7 +73,7 @@ class CapturePlan:
 
 
 def make_capture(folder: CaptureFolder, take: TakePhotographs, plan: CapturePlan, device: Device) -> Evaluation | None:
-    """Carry out the stages of a capture. Returns the scores of the held-out views, as in eval.json; None if none is.
+    """Carry out the stages of a capture. Returns the scores as in eval.json; None if no view is held out.
 
     folder: the output folder, claimed for this call (`CaptureFolder.claim`).
     take: function of the first stage, which returns the photographs.
