@@ -83,7 +83,7 @@ class CaptureProgress(LiveBar):
 
         text: the part of the stage, as in WORK_SHARES.
         fraction: fraction of this part that is done; None if unknown.
-        detail: text to show after it.
+        detail: text that replaces the percentage.
         """
         self._fraction = self._of_stage(text, fraction)
         now = time.monotonic()
@@ -151,7 +151,8 @@ class CaptureProgress(LiveBar):
 def of_stage(error: Exception, stage: str) -> ClsplatError | None:
     """Return an error whose message begins with the stage's name; None for an internal error, such as a bug.
 
-    Errors of clsplat keep their class. Errors of the system, memory and OpenCL driver become errors of clsplat.
+    An OSError, a MemoryError or an error of pyopencl becomes a ClsplatError, or an InputError if it has that exit status.
+    Other errors of clsplat keep their class.
     """
     start = f"stage {stage}: "
     if isinstance(error, OSError):
