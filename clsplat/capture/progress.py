@@ -151,7 +151,7 @@ class CaptureProgress(LiveBar):
 def of_stage(error: Exception, stage: str) -> ClsplatError | None:
     """Return an error whose message begins with the stage's name; None for an internal error, such as a bug.
 
-    An OSError, a MemoryError or an error of pyopencl becomes a ClsplatError, or an InputError if it has that exit status.
+    An OSError, a MemoryError or an error of pyopencl becomes a ClsplatError (InputError if it has its exit status).
     Other errors of clsplat keep their class.
     """
     start = f"stage {stage}: "

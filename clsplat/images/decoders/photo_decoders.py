@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of the photographs that OpenImageIO's wheel does not decode: HEIF, AVIF and raw files.
 
-A file's first bytes select the decoder. The extension counts only for raw files whose first bytes are those of any TIFF.
+A file's first bytes select the decoder. The extension counts only for raw files that begin with the first bytes of a TIFF.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def lacks_decoder(path: Path) -> bool:
 
 
 def wrong_contents(path: Path, head: bytes) -> InputError | None:
-    """Return the error for a file that has an extension of PHOTO_DECODERS but other contents; None for other extensions.
+    """Return the error for a file with an extension of PHOTO_DECODERS but other contents; None for other extensions.
 
     head: first bytes of the file, which no decoder recognises.
     """

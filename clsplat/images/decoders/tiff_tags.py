@@ -11,7 +11,7 @@ from pathlib import Path
 TIFF_BYTE_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 """Byte order, as a character for the module struct, by the first bytes of a TIFF."""
 MAX_TIFF_TAGS, MAX_TIFF_DIRECTORIES, MAX_TIFF_VALUES = 1024, 32, 1 << 16
-"""Limits on what is read: tags of a directory, directories of a file, and values of a tag. Damaged files may claim more."""
+"""Most tags of a directory, directories of a file, and values of a tag that are read. Damaged files may claim more."""
 _TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 _SUBFILE_TYPE, _STRIPS, _SUB_DIRECTORIES, _TILES, _DNG_VERSION = 254, (273, 279), 330, (324, 325), 50706
 
@@ -37,7 +37,7 @@ def is_cut_off(path: Path, order: str) -> bool:
 
 
 def _directories(file: io.BufferedReader, order: str) -> Iterator[dict[int, tuple[int, ...]]]:
-    """Yield each directory of a TIFF as the integers of its tags, by the tags' numbers; () for values of other types."""
+    """Yield each directory of a TIFF as the integers of its tags, by the tag's number; () for values of other types."""
     file.seek(4)
     waiting, seen = list(_unpacked(file.read(4), order, "I")), set[int]()
     while waiting and len(seen) < MAX_TIFF_DIRECTORIES:
