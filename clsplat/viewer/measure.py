@@ -18,8 +18,8 @@ from clsplat.errors import InputError
 MIN_CLICK_ALPHA = 0.5
 """Minimum alpha of a pixel on which a click hits the model."""
 CLICK_WINDOW_PX = 3
-"""Number of pixels on each side of a click to which a plane is fitted. One depth is not enough, because all pixels of a
-Gaussian have the same."""
+"""Number of pixels on each side of a click to which a plane is fitted. A single depth would not follow
+the surface, as it is the same on all pixels of a Gaussian."""
 SAME_SURFACE_RATIO = 0.1
 """Largest difference from the clicked depth, relative to it, of depths that can be on the same surface."""
 SURFACE_FITS = 5

@@ -136,7 +136,7 @@ def _set_exif(spec: Any, exif: bytes) -> None:
 
 
 def _number(value: Any) -> float | None:
-    """Return an EXIF value as a float, of several the first; None if it is negative, infinite or not a number."""
+    """Return an EXIF value, or the first of several, as a float; None if it is negative, infinite or no number."""
     value = value[0] if isinstance(value, (tuple, bytes)) and len(value) else value
     try:
         number = float(value)

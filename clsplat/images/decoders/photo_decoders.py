@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of the photographs that OpenImageIO's wheel does not decode: HEIF, AVIF and raw files.
 
-A file's first bytes select the decoder. The extension counts only for raw files that begin with the first bytes of a TIFF.
+A file's first bytes select the decoder. The extension counts only for raw files that begin like any TIFF.
 """
 
 from __future__ import annotations

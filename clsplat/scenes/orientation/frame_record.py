@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record of a scene's coordinate frame, frame.json: the similarity from the cameras' first frame, and its sources.
+"""frame.json, the record of a scene's coordinate frame: the similarity to it from the cameras' original frame.
 
 The file lies beside the cameras of a COLMAP model that `clsplat sfm` made, and in the folder of a run.
 """

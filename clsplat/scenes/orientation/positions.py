@@ -151,7 +151,7 @@ def _robust(
 def up_from_gps(cameras: Mapping[str, Camera], positions: Mapping[str, GpsPosition]) -> MeasuredUp | None:
     """Return the up direction of a fit to positions with altitudes; None if they do not give it to within a degree.
 
-    The errors of GPS are small enough only against the width of a wide capture, such as a drone's.
+    The errors of GPS are small enough only for a wide capture, such as a drone's.
     """
     import pycolmap
 

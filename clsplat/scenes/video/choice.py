@@ -28,8 +28,8 @@ FAST_RATIO = 3.0
 """A camera is too fast if its motion is above this multiple of its median while it moves, and above
 FAST_SIDES_PER_SECOND."""
 BLURRED_RATIO = 0.6
-"""A frame is blurred if its sharpness is below this fraction of its neighbours' upper quartile. Both are measured from
-SMOOTH_SHARPNESS up."""
+"""A frame is blurred if its detail (sharpness minus SMOOTH_SHARPNESS) is below this fraction of the upper quartile of
+its neighbours' detail."""
 NEIGHBOUR_SECONDS = 1.0
 """A frame's neighbours are the frames up to this many seconds before and after it."""
 MAX_ALIKE_RMS_LEVELS, MAX_ALIKE_RMS_PER_GRADIENT = 1.0, 0.2

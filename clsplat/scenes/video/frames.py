@@ -39,8 +39,7 @@ FRAME_JPEG_QUALITY = 97
 MIN_TEXTURED_FRACTION = 0.1
 """Smallest fraction of textured blocks, on average over all frames. A video with less shows a wall or is black."""
 MIN_DECODED_FRACTION = 0.9
-"""Fraction of the frames announced in the header, of which at least so many must decode. Otherwise the file counts as
-cut off or damaged."""
+"""Smallest fraction of the frames announced in the header that must decode. With fewer, the file counts as cut off."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ MIN_TRAVELLED = 0.1
 """Length of the camera's path, in longer sides, below which a video hardly shows different viewpoints. A walk of 60
 degrees around the demo's scene has 0.2."""
 ASSUMED_FOCAL = 0.8
-"""Focal length in longer sides, as of a phone, that is assumed to tell a camera that turns from one that moves."""
+"""Focal length in longer sides, as of a phone, that `rotation_field` assumes."""
 
 
 @dataclass(frozen=True)
