@@ -25,7 +25,7 @@ CAPTURE_RECORD_FILE = "capture.json"
 class CaptureFolder:
     """The output folder of a capture. Its attributes are the paths of the results.
 
-    frames: folder of the photographs that the first stage makes.
+    frames: name of the sub-folder with the frames or photographs that the first stage makes.
     """
 
     def __init__(self, path: Path, frames: str = "frames") -> None:
@@ -48,13 +48,14 @@ class CaptureFolder:
         }
 
     def asked(self) -> dict[str, Any]:
-        """Return input and settings of the call that made the folder; empty for a folder without capture.json."""
+        """Return the input and settings of the call that made the folder; {} for a folder without capture.json."""
         return dict(self._read()["asked"]) if is_file(self.record_path) else {}
 
     def claim(self, asked: Mapping[str, Any], verb: str, *, overwrite: bool = False) -> None:
-        """Record a call of the verb `verb` in capture.json, if the folder has no results or was made by the same call.
+        """Record a call in capture.json. The folder must have no results, or be made by the same call.
 
         asked: input and settings of the call, as values for JSON.
+        verb: command of the call, "capture" or "demo", for messages.
         overwrite: accept a folder that another call has made. If the call is the same, all results are made again.
         Raises InputError for a folder of another call, and for results that are not recorded in capture.json.
         """
@@ -97,7 +98,7 @@ class CaptureFolder:
             for file in owned_files(result):
                 remove(file)
             for folder in sorted((path for path in result.rglob("*") if path.is_dir()), reverse=True):
-                with suppress(OSError):  # a folder with files of others stays
+                with suppress(OSError):  # fails for a folder that still has other files, which stays
                     folder.rmdir()
         elif result.is_dir() and not result.is_symlink():
             shutil.rmtree(result)
@@ -120,7 +121,7 @@ class CaptureFolder:
 
 
 def _told(asked: Mapping[str, Any], keys: list[str]) -> str:
-    """Return the values of the settings `keys` as text."""
+    """Return the settings `keys` and their values as text, without those that are None or missing."""
     values = {key: asked[key] for key in keys if asked.get(key) is not None}
     texts = {key: examples(value) if isinstance(value, list) else value for key, value in values.items()}
     return ", ".join(f"{key} {text}" for key, text in texts.items()) or f"no {keys[0]}"

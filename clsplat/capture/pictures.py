@@ -28,7 +28,7 @@ TURNTABLE_VIDEO_FILE = "turntable.mp4"
 
 
 class ModelPictures:
-    """Pictures of a run's model, from a path around the cameras of its photographs.
+    """Pictures of a run's model, from a turntable: a path around the point that the photographs' cameras look at.
 
     cameras: cameras of the photographs.
     frames: number of frames of the turntable.
@@ -43,7 +43,7 @@ class ModelPictures:
         self.path = turntable(cameras, frames, up)
 
     def _drawn(self, camera: Camera) -> NDArray[np.uint8]:
-        """Render a picture (H, W, 3) over black."""
+        """Render the model on a black background, as 8-bit values (H, W, 3)."""
         picture = self._renderer.render(self._model, camera, (0.0, 0.0, 0.0)).image
         return np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
 
@@ -54,7 +54,7 @@ class ModelPictures:
     def write_turntable(self, folder: Path, progress: Progress = no_progress) -> Path | None:
         """Write the turntable's frames and, if PyAV is installed, its video. Returns the video's path, or None.
 
-        Frames that are there already stay. A complete turntable is not rendered again.
+        Existing frames are kept. If the video is missing or a frame was rendered, the video is encoded again.
         """
         folder.mkdir(exist_ok=True)
         video = None if video_missing() else folder / TURNTABLE_VIDEO_FILE

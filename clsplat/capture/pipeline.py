@@ -35,11 +35,11 @@ from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.sfm.reconstruct import DEFAULT_SFM_SETTINGS, SFM_RECORD_FILE, SfmSettings, reconstruct
 
 ASSUMED_PHOTOGRAPHS = 100
-"""Number of photographs for the remaining time as long as the number is not known."""
+"""Number of photographs that the estimate of the remaining time assumes until their number is known."""
 SFM_SECONDS_PER_PHOTOGRAPH = 0.7
 """Expected seconds of structure from motion per photograph, on two cores."""
 CPU_SECONDS_PER_STEP, GPU_SECONDS_PER_STEP = 0.05, 0.005
-"""Expected seconds of a training step before the first steps are measured: on two cores, and on a GPU."""
+"""Expected seconds of a training step before the first steps are measured: on two CPU cores, and on a GPU."""
 SECONDS_PER_PICTURE = 0.15
 """Expected seconds to render and write a frame of a turntable, on two cores."""
 SECONDS_PER_REPORT = 5.0
@@ -54,10 +54,10 @@ class CapturePlan:
     """Settings of a capture.
 
     again: the command that goes on after an interruption.
-    source: text that identifies the input and the settings of the photographs.
+    source: text that identifies the input and the settings of the first stage.
     config: settings of the training.
-    given: names of the training settings that must not change, while others are adapted to the scene; None to change
-        none.
+    given: names of the training settings that must not change, while others are adapted to the scene; None to keep all
+        settings.
     sfm: settings of structure from motion.
     frames_seconds: expected duration of the first stage in seconds.
     turntable_frames: number of frames of the turntable.
@@ -73,12 +73,12 @@ class CapturePlan:
 
 
 def make_capture(folder: CaptureFolder, take: TakePhotographs, plan: CapturePlan, device: Device) -> Evaluation | None:
-    """Carry out the stages of a capture. Returns the scores of the held-out views, as in eval.json; None without any.
+    """Carry out the stages of a capture. Returns the scores as in eval.json; None if no view is held out.
 
-    folder: the output folder, claimed by this call.
-    take: the first stage.
-    Errors of a stage begin with its name.
-    After KeyboardInterrupt the same call goes on in the stage that was under way.
+    folder: the output folder, claimed for this call (`CaptureFolder.claim`).
+    take: function of the first stage, which returns the photographs.
+    Messages of errors begin with the stage's name. After KeyboardInterrupt, a repetition of the call goes on in the
+    stage that was interrupted.
     """
     start = time.monotonic()
     with CaptureProgress(_expected(plan, device), plan.again) as progress:
@@ -118,7 +118,7 @@ def _expected(plan: CapturePlan, device: Device) -> dict[str, float]:
 
 
 def _trained(folder: CaptureFolder, plan: CapturePlan, device: Device, progress: CaptureProgress) -> Run:
-    """Train the scene, or go on with its training."""
+    """Train the scene, or continue the training that an earlier call began. Returns the run."""
     record = load_document(folder.scene / SFM_RECORD_FILE, "the record of a result of sfm", "its fingerprint")
     folder.begin("training", f"{record.get('fingerprint')} {plan.config.iterations}")
     return train_scene(folder.scene, folder.run, plan.config, device, progress, plan.given)
@@ -144,7 +144,7 @@ def _show(folder: CaptureFolder, run: Run, plan: CapturePlan, device: Device, pr
 
 
 def _write_report(folder: CaptureFolder, run: Run, progress: Progress) -> None:
-    """Write the report, as a copy of the run's report if the training has written it."""
+    """Copy the run's report to the output folder. If the training wrote no report, write one first."""
     if folder.report.is_file():
         progress("using the report written before", 1.0)
         return
@@ -155,7 +155,10 @@ def _write_report(folder: CaptureFolder, run: Run, progress: Progress) -> None:
 
 
 def _closing(folder: CaptureFolder, photographs: Path, run: Run, result: Evaluation | None, seconds: float) -> str:
-    """Return the last lines of a capture: its quality, its results, and the command that shows the model."""
+    """Return the text for the end of a capture: time, scores, the command that shows the model, and the results' paths.
+
+    photographs: folder of the photographs. result: scores of the held-out views; None if no view is held out.
+    """
     minutes, rest = divmod(round(seconds), 60)
     scores = ""
     if result is not None:

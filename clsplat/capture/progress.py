@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a capture over all its stages, with the remaining time, and the stage in messages of errors."""
+"""Progress of a capture over all its stages, with the remaining time. Adds the stage's name to messages of errors."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ WORK_SHARES = {
         "undistorting photos": 0.03,
     },
 }
-"""Shares of a stage's time that its parts take, keyed by the beginnings of the parts' texts."""
+"""Fractions of a stage's time that its parts take, by stage and by how the parts' progress texts begin."""
 BAR_STEPS = 1000
 """Length of the live bar in steps."""
 PACE_PRIOR_SECONDS = 20.0
-"""Weight of the expected durations in the pace: seconds of work that count as done in the expected time."""
+"""Weight of the prior in `CaptureProgress.pace`: it counts as this many seconds of work done at the expected speed."""
 REUSED_FRACTION = 0.02
-"""A stage that ends within this fraction of its expected duration has used an earlier result. It says nothing about the
-machine's pace."""
+"""A stage that ends within this fraction of its expected duration has reused an earlier result, so its duration is left
+out of the pace."""
 
 
 class CaptureProgress(LiveBar):
-    """Progress of a capture on standard error: a live bar on a terminal, else a line every ten seconds.
+    """Progress of a capture on standard error: a live bar on a terminal, else a line for each part and every 10 s.
 
     expected: expected duration in seconds of each stage, in the stages' order. `expect` changes one.
     again: the command that goes on after an interruption.
-    forecast: estimator of the remaining time of the current stage, or None.
+    forecast: estimator of the current stage's remaining time; None to estimate it from the expected duration.
     """
 
     def __init__(self, expected: Mapping[str, float], again: str) -> None:
@@ -57,7 +57,7 @@ class CaptureProgress(LiveBar):
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Context of a stage. Messages of errors in it begin with the stage, and an interruption says how to go on."""
+        """Context of a stage. Messages of errors in it begin with its name, and KeyboardInterrupt says how to go on."""
         self.stage_name, self.forecast, self._fraction = name, None, None
         self._stage_began = time.monotonic()
         try:
@@ -79,13 +79,18 @@ class CaptureProgress(LiveBar):
         return f" {error.args[0]}" if error.args else ""
 
     def __call__(self, text: str, fraction: float | None = None, detail: str = "") -> None:
-        """Report progress in the current stage: the part of the work, the fraction of it that is done, and a detail."""
+        """Report progress in the current stage.
+
+        text: the part of the stage, as in WORK_SHARES.
+        fraction: fraction of this part that is done; None if unknown.
+        detail: text that replaces the percentage.
+        """
         self._fraction = self._of_stage(text, fraction)
         now = time.monotonic()
         key = f"{self.stage_name} {text}"
         if self.live is None:
             if key != self._told or now - self._told_at >= PLAIN_LINE_SECONDS:
-                with suppress(OSError):  # the program that reads the output has ended: the work goes on
+                with suppress(OSError):  # if the program that reads the output has ended, the work goes on
                     print(self._line(text, fraction, detail), file=sys.stderr, flush=True)
                 self._told, self._told_at = key, now
         elif key != self._told or now - self._told_at >= LIVE_TEXT_SECONDS:
@@ -109,7 +114,7 @@ class CaptureProgress(LiveBar):
         return self._left_of_stage() + self.pace() * sum(self.expected[name] for name in later)
 
     def pace(self) -> float:
-        """Factor by which the finished stages took longer than expected, with a prior of 1."""
+        """Ratio of the finished stages' duration to the expected one, with a prior of 1 (PACE_PRIOR_SECONDS)."""
         worked = {name: spent for name, spent in self._spent.items() if spent > REUSED_FRACTION * self.expected[name]}
         expected = sum(self.expected[name] for name in worked)
         return (PACE_PRIOR_SECONDS + sum(worked.values())) / (PACE_PRIOR_SECONDS + expected)
@@ -127,7 +132,10 @@ class CaptureProgress(LiveBar):
         return (1 - self._fraction) * (spent + (1 - self._fraction) * usual)
 
     def _of_stage(self, text: str, fraction: float | None) -> float | None:
-        """Return the fraction of the current stage that is done, from the fraction of a part; it never falls."""
+        """Return the fraction of the current stage that is done, from the fraction of the part `text`.
+
+        It never falls in a stage of WORK_SHARES. Without a new fraction, the result is the one before.
+        """
         shares = WORK_SHARES.get(self.stage_name)
         before = self._fraction
         if shares is None:
@@ -141,9 +149,10 @@ class CaptureProgress(LiveBar):
 
 
 def of_stage(error: Exception, stage: str) -> ClsplatError | None:
-    """Return an error whose message begins with the stage; None for an error that is not one for users.
+    """Return an error whose message begins with the stage's name; None for an internal error, such as a bug.
 
-    The error keeps its exit status, and its class unless it is an error of the system or of the driver.
+    An OSError, a MemoryError or an error of pyopencl becomes a ClsplatError (InputError if it has its exit status).
+    Other errors of clsplat keep their class.
     """
     start = f"stage {stage}: "
     if isinstance(error, OSError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`run_capture`: from people's own photographs or videos to a model, its report and pictures."""
+"""`run_capture`: from photographs or videos to a model, its report and pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clsplat.selftest.driver_check import require
 CAPTURE_TURNTABLE_FRAMES = 120
 """Number of frames of the turntable: five seconds of video."""
 FRAMES_SECONDS_PER_VIDEO = 60.0
-"""Expected seconds to take the frames of a video, as long as its length is not known."""
+"""Expected seconds to take the frames of a video, whose length is not known beforehand."""
 
 
 def run_capture(
@@ -35,16 +35,16 @@ def run_capture(
 ) -> Evaluation | None:
     """Write frames/, scene/, run/, report.html, thumbnail.png, turntable/ and capture.json to the folder `output`.
 
-    sources: a folder of photographs, videos or both, or videos.
+    sources: one folder with photographs, videos or both, or else video files.
     iterations: number of training steps.
     frames: number of frames of each video; None for a number by its length and motion.
     again: the command that goes on after an interruption.
     given: names of the training settings that the findings about the scene must not change, such as "iterations".
-    device: name of the device, as for `clsplat devices`.
-    overwrite: replace the results of another call in the output folder.
+    device: selector of the device, as for --device; None for the default device.
+    overwrite: accept and replace the results in the output folder (`CaptureFolder.claim`).
 
-    Returns the scores of the held-out views, as in eval.json. Raises InputError for wrong input.
-    Errors of a stage begin with the stage.
+    Returns the scores of the held-out views, as in eval.json; None if no view is held out. Raises InputError for wrong
+    input. Messages of errors in a stage begin with its name.
     """
     check_sources(sources, output, frames)
     opened = require(open_device(device))  # first, so that a wrong name fails before minutes of work

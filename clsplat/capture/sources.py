@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input of a capture: a folder of photographs, videos or both, or videos. Frames of videos become photographs."""
+"""Input of a capture: a folder with photographs, videos or both, or else video files."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from clsplat.scenes.video.reading import VIDEO_INPUT_SUFFIXES, is_video_name
 class PhotographSource:
     """Photographs for structure from motion.
 
-    path: folder of the photographs, with the videos whose frames are used too.
-    count: number of photographs and frames.
-    frames: number of frames of each video in the folder; None for a number by length and motion, or without videos.
-    frames_to: folder of these frames; None without videos.
+    path: folder of the photographs. It may also contain videos, whose frames are used.
+    count: number of photographs and of frames together.
+    frames: number of frames of each video in `path`; None for a number by the video's length and motion.
+    frames_to: folder of the frames of these videos; None if `path` has no videos.
     """
 
     path: Path
@@ -36,8 +36,9 @@ class PhotographSource:
 def check_sources(sources: Sequence[Path], output: Path, frames: int | None = None) -> None:
     """Check the input of a capture before anything is written.
 
-    Raises InputError for input that is missing or is not a video or folder, and for a folder among several inputs.
-    Also for an output inside the input, as its pictures would count as photographs.
+    frames: number of frames of each video, as given; None if not given.
+    Raises InputError for input that is missing or is not a video or folder, and for a folder among several inputs. An
+    output inside the input is an error too, because its pictures would count as photographs.
     """
     if not sources:
         raise InputError("INPUT is missing, expected a folder of photographs, or videos")
@@ -71,13 +72,15 @@ def check_sources(sources: Sequence[Path], output: Path, frames: int | None = No
 def photographs_of(
     sources: Sequence[Path], folder: CaptureFolder, frames: int | None, progress: Progress
 ) -> PhotographSource:
-    """Take the frames of videos to the capture's folder. Returns the photographs with these frames.
+    """Write frames of the videos to the capture's folder. Returns the photographs together with these frames.
 
-    Photographs of a folder are used where they are. frames: number of frames of each video; None for a number by its
-    length and motion. Raises InputError like `take_frames`.
+    Photographs of a folder are used where they are.
+
+    frames: number of frames of each video; None for a number by the video's length and motion.
+    Raises InputError like `take_frames`.
     """
     if not sources[0].is_dir():
-        # names of several videos begin at the folder that they share
+        # several videos are named by their paths below their common folder
         root = Path(os.path.commonpath([path.absolute().parent for path in sources])) if len(sources) > 1 else None
         videos = [path.absolute() for path in sources] if root else sources
         taken = take_frames(videos, folder.frames, root=root, count=frames, progress=progress)

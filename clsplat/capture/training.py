@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stage of a capture that trains: with the settings that the scene asks for, and from the latest checkpoint."""
+"""The training stage of a capture. It adapts settings to the scene, and continues an interrupted training."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def train_scene(
     progress: CaptureProgress,
     given: Collection[str] | None,
 ) -> Run:
-    """Train the scene in `folder` to a run at `path`. A run that is there continues, and a finished one is returned.
+    """Train the scene in `folder` to a run at `path`. An unfinished run there continues, a finished one is returned.
 
     config: settings of a new run.
     given: names of the settings that must not change; None to change no setting. Others are adapted to the scene as
-    by `clsplat train --auto`, and the schedule to the number of steps.
-    Raises InputError like `clsplat.train`. After KeyboardInterrupt there is a checkpoint.
+        by `clsplat train --auto`, and the schedule to the number of steps.
+    Raises InputError like `clsplat.train`. The message of a KeyboardInterrupt names the step of the latest checkpoint.
     """
     earlier = Run.open(path) if is_run(path) else None
     if earlier is not None and _is_finished(earlier):
@@ -89,7 +89,10 @@ def _is_finished(run: Run) -> bool:
 
 
 def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: CaptureProgress) -> Scene:
-    """Load the scene for a training with these settings, and check that its pictures decode."""
+    """Load the scene for a training with these settings, and check that its pictures decode.
+
+    earlier: the run that continues; None for a new run.
+    """
     scene = load_scene(
         folder,
         resolution=config.resolution,
@@ -127,7 +130,7 @@ def _adapted(
 
 
 def _reporting(config: TrainConfig, progress: CaptureProgress) -> Callable[[StepReport], Any]:
-    """Return a function that reports a training step as progress of the capture."""
+    """Return the callback that reports each training step as progress of the capture."""
 
     def report(step: StepReport) -> None:
         if progress.forecast is not None:

@@ -31,9 +31,10 @@ class CaptureVerb(Verb):
     output: Output
     """Folder for the results: frames/ of videos, scene/, run/, turntable/, report.html, thumbnail.png, capture.json."""
     frames: OptionalInt = None
-    """Number of frames to take from each video, as with clsplat sfm --frames. If not given: by length and motion."""
+    """Number of frames to take from each video, as with clsplat sfm --frames. If not given, the number follows from the
+    video's length and motion."""
     iterations: int = CAPTURE_ITERATIONS
-    """Training steps. If not given, they also follow what the photographs ask for, as with clsplat train --auto."""
+    """Training steps. If not given, the photographs' findings may change the number, as with clsplat train --auto."""
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
     overwrite: Flag = False
     """Replace the results of an earlier capture in the output folder. Stages whose input is the same are kept; if the
@@ -44,7 +45,7 @@ class CaptureVerb(Verb):
     """Names of the settings given on the command line."""
 
     def completed(self, given: Collection[str]) -> CaptureVerb:
-        """Return the arguments with the names of the flags that are given."""
+        """Return these arguments with the names of the flags given on the command line."""
         return replace(self, given=frozenset(given))
 
     @property

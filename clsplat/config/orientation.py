@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of a scene's frame: whether it is turned upright (`--orient`), and what gives its scale (`--scale`)."""
+"""Settings of a scene's coordinate frame: its orientation (`--orient`), and what gives its scale (`--scale`)."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ def parse_scale(text: str) -> ScaleRule | None:
 
 @dataclass(frozen=True)
 class FrameUse:
-    """How the frame of a scene is changed.
+    """How the coordinate frame of a scene is changed.
 
-    orient: "up" turns the scene upright, with the ground at zero. "none" gives it the axes that its cameras had first.
-        None keeps the frame that it has.
-    scale: value of --scale; "" keeps the scale.
+    orient: "up" turns the scene upright, with the ground at zero. "none" restores the axes that its cameras had first.
+        None keeps the present axes.
+    scale: value of --scale; "" keeps the present scale.
     """
 
     orient: Orient | None = None
@@ -79,4 +79,4 @@ class FrameUse:
 
 
 AS_IN_FILES = FrameUse()
-"""The frame that the scene's files have."""
+"""No change: the scene keeps the frame of its files."""

@@ -25,8 +25,8 @@ MAX_METADATA_BYTES = 1 << 18
 _APPLE_NOTE = b"Apple iOS\0\0\1MM"
 _APPLE_ACCELERATION_TAG, _SIGNED_RATIONAL = 8, 10
 _GIMBAL_ANGLE = re.compile(rb'Gimbal(Pitch|Roll)Degree\s*(?:=\s*"|>)\s*([-+]?\d{1,4}(?:\.\d{1,9})?)')
-# Gravity in the axes of an upright picture (x right, y down, z forward) for each EXIF orientation, from CoreMotion's
-# axes of an iPhone (x right, y up, z out of the screen). The sensor is upright in landscape, with the phone's top left.
+# Rotation from CoreMotion's axes of an iPhone (x right, y up, z out of the screen) to the axes of the upright picture
+# (x right, y down, z forward), by EXIF orientation. Orientation 1 is landscape with the top of the phone at the left.
 _PICTURE_FROM_PHONE = {
     1: ((0, -1, 0), (-1, 0, 0), (0, 0, -1)),
     3: ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
@@ -49,7 +49,7 @@ class GpsPosition:
 
 
 def gps_of(path: Path) -> GpsPosition | None:
-    """Return the position in a photograph's EXIF. None if there is none, or the file cannot be read."""
+    """Return the position in a photograph's EXIF; None if EXIF has no valid one, or the file cannot be read."""
     try:
         source = open_image(path)
     except InputError:
@@ -69,7 +69,10 @@ def gps_of(path: Path) -> GpsPosition | None:
 
 
 def _degrees(spec: Any, name: str, negative: str, most: float) -> float | None:
-    """Return an angle of EXIF's GPS tags in degrees; None if it is missing or over `most`."""
+    """Return the angle of a GPS tag in degrees; None if it is missing or over `most`.
+
+    name: "Latitude" or "Longitude". negative: letter of the hemisphere with negative angles.
+    """
     value = spec.getattribute(f"GPS:{name}")
     parts = value if isinstance(value, tuple) else (value,)
     if not 1 <= len(parts) <= 3 or not all(isinstance(part, int | float) and isfinite(part) for part in parts):
@@ -84,7 +87,7 @@ def _degrees(spec: Any, name: str, negative: str, most: float) -> float | None:
 def gravity_of(path: Path, *, upright: bool) -> Float64 | None:
     """Return the direction of gravity, a unit vector (3,) in the picture's axes: x right, y down, z forward.
 
-    It comes from an iPhone's accelerometer or the gimbal angles of a DJI drone. None if the file has neither.
+    The direction comes from an iPhone's accelerometer or a DJI drone's gimbal angles; None if the file has neither.
 
     upright: True for the axes of the picture after its EXIF orientation, False for those of the pixels as stored.
     """
@@ -126,7 +129,10 @@ def _orientation(path: Path, *, upright: bool) -> int:
 
 
 def _apple_acceleration(data: bytes) -> Float64 | None:
-    """Return the accelerometer's vector (3,), in multiples of g, from Apple's maker note; None if there is none."""
+    """Return the accelerometer's vector (3,), in multiples of g, from Apple's maker note.
+
+    None if the data has no such vector, or if its length is not near 1.
+    """
     at = data.find(_APPLE_NOTE)
     if at < 0:
         return None

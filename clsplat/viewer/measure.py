@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance between two clicked points of the model, and the flags that make it a known length. Uses neither OpenCL nor
-viser."""
+"""Distance between two clicked points of the model, and the flags that set the scale by it.
+
+The module uses neither OpenCL nor viser.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,14 @@ from clsplat.errors import InputError
 MIN_CLICK_ALPHA = 0.5
 """Minimum alpha of a pixel on which a click hits the model."""
 CLICK_WINDOW_PX = 3
-"""Number of pixels on each side of a click whose depths are fitted by a plane, as a Gaussian has one depth all over."""
+"""Number of pixels on each side of a click to which a plane is fitted. A single depth would not follow
+the surface, as it is the same on all pixels of a Gaussian."""
 SAME_SURFACE_RATIO = 0.1
-"""Largest relative difference of depths in the window that can be on the clicked surface."""
+"""Largest difference from the clicked depth, relative to it, of depths that can be on the same surface."""
 SURFACE_FITS = 5
 """Number of reweighted least-squares fits of the plane."""
 FLAG_PRECISION = 1e-5
-"""Precision of coordinates in the flag, relative to the distance of the points."""
+"""Precision of coordinates in the flag --scale, relative to the distance between the points."""
 MAX_LENGTH_METRES = 1e6
 """Largest length that can be entered, in metres."""
 
@@ -32,8 +35,8 @@ def point_at(camera: Camera, depth: Float32, alpha: Float32, place: tuple[float,
 
     camera: a pinhole camera of the picture's size.
     depth: (H, W), along the camera's axis in world units, of the surface that is seen. alpha: (H, W).
-    place: from the picture's left and top, as fractions of its width and height.
-    Raises InputError for a click beside the model.
+    place: of the click, from the picture's left and top, as fractions of its width and height.
+    Raises InputError for a click that does not hit the model.
     """
     if not all(0 <= value <= 1 for value in place):  # false for NaN too
         raise InputError("the click is outside the picture")
@@ -48,7 +51,7 @@ def point_at(camera: Camera, depth: Float32, alpha: Float32, place: tuple[float,
 
 
 def _surface_depth(depth: Float32, alpha: Float32, place: tuple[float, float]) -> float:
-    """Return the depth of the surface at a place (x, y) in pixels, by a robust fit of a plane around it.
+    """Return the depth of the surface at a place (x, y) in pixels, by a robust fit of a plane to the depths around it.
 
     On a plane, 1 / depth is linear in x and y. Weights are Tukey's biweight.
     """
@@ -93,7 +96,7 @@ class Measurement:
             return ("Click on a point.", "Click on a second point.")[len(self.points)]
         shown = f"Distance: {distance:.6g} world units."
         if not 0 < metres <= MAX_LENGTH_METRES or distance == 0:
-            return f"{shown} Enter its length in metres for a flag."
+            return f"{shown} Enter its length in metres to see the flag that sets the scale."
         digits = max(0, math.ceil(-math.log10(FLAG_PRECISION * distance)))
         ends = ",".join(f"{value:.{digits}f}" for point in self.points for value in point)
         return (

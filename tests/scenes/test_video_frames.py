@@ -99,7 +99,7 @@ def test_the_same_bytes_twice_and_an_existing_result(video: Path, tmp_path: Path
     assert again.videos[0].preview == first.videos[0].preview
     assert (tmp_path / "a" / FRAME_TABLE_FILE).stat().st_mtime_ns == before
     assert frame_sequences(tmp_path / "a") == [first.names]
-    refuses("a: has the frames of other videos, or of another number", take_frames, [video], tmp_path / "a", count=7)
+    refuses("a: has frames of other videos, or another number of frames", take_frames, [video], tmp_path / "a", count=7)
     (tmp_path / "a" / first.names[2]).unlink()
     refuses(
         r"a: walk\.mp4/\d+\.jpg were removed or changed; give this folder",
@@ -296,7 +296,7 @@ def sound(path: Path) -> None:
     [
         (lambda path, whole: path.unlink(), "no such file, expected a video"),
         (lambda path, whole: (path.unlink(), path.mkdir()), "is a folder, expected a video"),
-        (lambda path, whole: path.write_bytes(b""), r"cannot be read as a video \(.*\), expected a whole file"),
+        (lambda path, whole: path.write_bytes(b""), r"cannot be read as a video \(.*\), expected a complete file"),
         (lambda path, whole: path.write_text("hello\n" * 99), r"cannot be read as a video \(Invalid data"),
         (lambda path, whole: path.write_bytes(cut(whole)), r"cannot be read as a video \(Invalid data"),
         (

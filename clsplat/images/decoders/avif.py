@@ -22,7 +22,7 @@ _ORIENTATION_TAG = 0x112
 
 
 def open_avif_photo(path: Path) -> DecodedPhoto:
-    """Open the first image of an AVIF file. Decodes no pixels.
+    """Open the first image of an AVIF file, without decoding its pixels.
 
     Raises InputError if Pillow lacks libavif, or the header is damaged.
     """

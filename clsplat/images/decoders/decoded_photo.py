@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs that other libraries than OpenImageIO decode, behind the methods of OpenImageIO's input.
+"""Photographs that libraries other than OpenImageIO decode, with the methods of OpenImageIO's ImageInput.
 
-A module for each library opens them: `heif`, `avif` and `raw`. `photo_decoders` selects the module.
+The modules `heif`, `avif` and `raw` open them with one library each. `photo_decoders` selects the module.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ _GPS_ANGLES = {(_GPS_IFD, 2): "GPS:Latitude", (_GPS_IFD, 4): "GPS:Longitude"}
 
 
 class DecodedPhoto:
-    """A photograph with the methods of OpenImageIO's input that readers of images call.
+    """A photograph with those methods of OpenImageIO's ImageInput that clsplat's readers of images call.
 
-    The pixels are decoded when they are read. `geterror` then gives the error, as for OpenImageIO's input.
+    `read_image` decodes the pixels. If it fails, `geterror` returns the message, as in OpenImageIO.
     """
 
     def __init__(self, kind: str, spec: Any, decode: Callable[[], tuple[NDArray[Any], float]]) -> None:
-        """Keep the header, and the function that decodes.
+        """Store the header, and the function that decodes the pixels.
 
         kind: name of the format, such as "heif".
         spec: OpenImageIO's specification, with the size of the decoded pixels and the attributes from EXIF.
-        decode: returns pixels (H, W, C) of unsigned integers, and the integer that stands for 1.
+        decode: returns pixels (H, W, C) of unsigned integers, and the integer that stands for the value 1.0.
         """
         self._kind, self._spec, self._decode = kind, spec, decode
         self._error = ""
@@ -66,7 +66,7 @@ class DecodedPhoto:
         return self._kind
 
     def read_image(self, form: Any) -> NDArray[Any] | None:
-        """Decode the pixels (H, W, C), None after an error. form: OpenImageIO's pixel type of the result."""
+        """Decode the pixels (H, W, C); None after an error. form: OpenImageIO's type of the result's values."""
         try:
             pixels, highest = self._decode()
             pixels = np.ascontiguousarray(pixels)
@@ -98,7 +98,7 @@ def photo_spec(width: int, height: int, channels: str, form: Any, exif: bytes | 
     """Return OpenImageIO's specification of a photograph that is upright and has straight alpha.
 
     channels: a letter for each channel, such as "RGBA" or "YA".
-    form: OpenImageIO's pixel type.
+    form: OpenImageIO's type of the stored values.
     exif: EXIF data, whose values become attributes. Its orientation becomes EXIF_ORIENTATION_ATTRIBUTE.
     """
     spec = oiio.ImageSpec(width, height, len(channels), form)
@@ -139,7 +139,7 @@ def _set_exif(spec: Any, exif: bytes) -> None:
 
 
 def _number(value: Any) -> float | None:
-    """Return an EXIF value, or the first of several, as a float; None if it is not a finite number of at least 0."""
+    """Return an EXIF value, or the first of several, as a float; None if it is negative, infinite or no number."""
     value = value[0] if isinstance(value, (tuple, bytes)) and len(value) else value
     try:
         number = float(value)
@@ -149,24 +149,30 @@ def _number(value: Any) -> float | None:
 
 
 def decoder_message(error: Exception) -> str:
-    """Return the text of a decoder's exception in one line, without the b'' of texts that are bytes."""
+    """Return the text of a decoder's exception in one line. A text that is bytes is decoded from UTF-8."""
     told = error.args[-1] if error.args else ""
     text = told.decode("utf-8", "replace") if isinstance(told, bytes) else str(told)
     return " ".join(text.split()) or type(error).__name__
 
 
 def undecodable(path: Path, kind: str, error: Exception) -> InputError:
-    """Return the error for a file that begins like a photograph of a kind, but whose header is damaged."""
+    """Return the error for a file that begins like a photograph of `kind`, but whose header is damaged.
+
+    kind: name for messages, with its article. error: the decoder's exception.
+    """
     return InputError(
         f"{path}: does not decode as {kind}: {decoder_message(error)}; copy the picture again or leave it out"
     )
 
 
 def without_extra(path: Path, kind: str, package: str) -> InputError:
-    """Return the error for a photograph whose decoder is not installed."""
+    """Return the error for a photograph whose decoder is not installed.
+
+    kind: name for messages, with its article. package: the missing package.
+    """
     return InputError(f"{path}: {kind} needs {package}, which is not installed: {PHOTOS_EXTRA}")
 
 
 def whole_file(path: Path) -> io.BytesIO:
-    """Return a file's bytes for a decoder, so that no file stays open and names need no encoding."""
+    """Read a file for a decoder. So no file stays open, and the decoder need not handle the encoding of its name."""
     return io.BytesIO(path.read_bytes())

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec, undecodable, whole_file, without_extra
 
 _CHANNELS = {"L": "Y", "LA": "YA", "La": "YA", "RGB": "RGB", "RGBA": "RGBA", "RGBa": "RGBA"}
-"""Channels of libheif's modes, which end in the number of bits if that is not 8."""
+"""Letters of the channels by pillow-heif's image mode, without the ";" and number of bits at the end of some modes."""
 
 
 def open_heif_photo(path: Path) -> DecodedPhoto:
-    """Open the primary image of a HEIF file. Decodes no pixels.
+    """Open the primary image of a HEIF file, without decoding its pixels.
 
     Raises InputError if pillow-heif is missing, or the header is damaged.
     """

@@ -33,10 +33,10 @@ _TIFF_RAW_EXTENSIONS = (".nef", ".arw")
 class PhotoDecoder:
     """Decoder of a kind of photographs.
 
-    kind: the name for messages, with its article.
-    extensions: lower-case extensions of its files.
-    module: the Python package that decodes.
-    open: opens a photograph, without decoding its pixels. Raises InputError.
+    kind: name of the photographs for messages, with its article.
+    extensions: lower-case extensions of their files.
+    module: the Python module that decodes.
+    open: function that opens a photograph without decoding its pixels. Raises InputError.
     """
 
     kind: str
@@ -60,7 +60,7 @@ LOSSY_PHOTO_FORMATS = ("heif", "avif")
 
 
 def decoder_of(path: Path, head: bytes) -> PhotoDecoder | None:
-    """Return the decoder of a photograph, None if OpenImageIO should read it. head: the file's first bytes."""
+    """Return the decoder of a file; None if OpenImageIO should read it. head: its first PHOTO_HEAD_BYTES."""
     brands = _brands(head)
     if brands & _AVIF_BRANDS:
         return PHOTO_DECODERS["avif"]
@@ -73,7 +73,7 @@ def decoder_of(path: Path, head: bytes) -> PhotoDecoder | None:
 
 @cache
 def decoder_versions() -> tuple[str, ...]:
-    """Return the versions of the packages that decode, "" for those that are not installed."""
+    """Return the versions of pillow, pillow-heif and rawpy, "" for a package that is not installed."""
     found = []
     for package in ("pillow", "pillow-heif", "rawpy"):
         try:
@@ -90,9 +90,9 @@ def lacks_decoder(path: Path) -> bool:
 
 
 def wrong_contents(path: Path, head: bytes) -> InputError | None:
-    """Return the error for a file whose extension is that of a photograph in PHOTO_DECODERS, but not its contents.
+    """Return the error for a file with an extension of PHOTO_DECODERS but other contents; None for other extensions.
 
-    head: first bytes of a file that no decoder recognises.
+    head: first bytes of the file, which no decoder recognises.
     """
     extension = path.suffix.lower()
     kind = next((each.kind for each in PHOTO_DECODERS.values() if extension in each.extensions), "")
@@ -103,7 +103,7 @@ def wrong_contents(path: Path, head: bytes) -> InputError | None:
 
 
 def without_converted(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
-    """Return the pictures to use, and the photographs of PHOTO_DECODERS that are there in another format too.
+    """Return the pictures to use, and the photographs of PHOTO_DECODERS that also exist in another format.
 
     IMG_1.dng and IMG_1.heic are left out if IMG_1.jpg or IMG_1.heic.jpg is in their folder. Cameras write a JPEG beside
     a raw file, and users convert HEIC for other programs. IMG_1.heic.png may be a mask, by COLMAP's rule for names.

@@ -22,17 +22,17 @@ from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec, unde
 from clsplat.images.decoders.tiff_tags import TIFF_BYTE_ORDERS, is_cut_off
 
 SRGB_GAMMA = (2.4, 12.92)
-"""Exponent and slope of the sRGB curve, as LibRaw wants them."""
+"""Exponent of the sRGB curve and slope of its linear part, for LibRaw."""
 EXIF_SEARCH_BYTES = 1 << 20
-"""Number of bytes at the start of a raw file in which its EXIF data is searched."""
+"""Number of bytes read to find the EXIF data of a raw file."""
 _ORIENTATION_BY_FLIP = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
-"""EXIF orientation by LibRaw's flip."""
+"""EXIF orientation by LibRaw's number for it, `flip`."""
 _FUJI_SIGNATURE, _FUJI_JPEG_OFFSET = b"FUJIFILMCCD-RAW", 84
 """First bytes of RAF, and the offset at which RAF gives the offset of its JPEG preview, which has the EXIF data."""
 
 
 def open_raw_photo(path: Path) -> DecodedPhoto:
-    """Open a raw photograph. Develops no pixels.
+    """Open a raw photograph, without developing its pixels.
 
     Raises InputError if rawpy is missing, or the file is not a raw photograph that LibRaw knows.
     """
@@ -50,7 +50,7 @@ def open_raw_photo(path: Path) -> DecodedPhoto:
     width, height = _developed_size(sizes)
     spec = photo_spec(width, height, "RGB", oiio.UINT16, _exif(path))
     spec.attribute("Orientation", _ORIENTATION_BY_FLIP.get(int(sizes.flip), 1))
-    if taken.focal_length > 0:  # which LibRaw also finds in MakerNotes
+    if taken.focal_length > 0:  # LibRaw also finds the focal length in maker notes
         spec.attribute("Exif:FocalLength", float(taken.focal_length))
     for name, text in (("Exif:LensMake", lens.make), ("Exif:LensModel", lens.model)):
         if text and not spec.get_string_attribute(name):
@@ -59,7 +59,7 @@ def open_raw_photo(path: Path) -> DecodedPhoto:
 
 
 def _check_is_whole(path: Path) -> None:
-    """Raise InputError for a truncated file that is a TIFF, before LibRaw prints a message about it."""
+    """Raise InputError for a truncated TIFF file. For such a file, LibRaw would print a message of its own."""
     with open(path, "rb") as file:
         order = TIFF_BYTE_ORDERS.get(file.read(4))
     if order and is_cut_off(path, order):
@@ -85,22 +85,23 @@ def _developed(path: Path) -> NDArray[Any]:
         raw.unpack()
         balance = raw.camera_whitebalance
         pixels: NDArray[Any] = raw.postprocess(
-            # Without the camera's balance, LibRaw would balance by the picture. Daylight's depends on the camera alone.
+            # False gives the daylight balance, which depends on the camera alone. With True and no balance in the file,
+            # LibRaw would compute one from the picture.
             use_camera_wb=min(balance[:3]) > 0,
             output_color=rawpy.ColorSpace.sRGB,
             gamma=SRGB_GAMMA,
             no_auto_bright=True,
-            adjust_maximum_thr=0.0,  # the default takes the picture's own maximum for white
+            adjust_maximum_thr=0.0,  # by default, white would depend on the picture's maximum
             output_bps=16,
             user_sat=_full_exposure(raw),
             user_flip=0,
         )
-    grey = pixels.ndim == 2 or pixels.shape[2] == 1  # of a camera without colours
+    grey = pixels.ndim == 2 or pixels.shape[2] == 1  # from a monochrome camera
     return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2) if grey else pixels
 
 
 def _full_exposure(raw: Any) -> int | None:
-    """Return the number of levels from black to white, or None to keep LibRaw's number.
+    """Return the number of sensor levels from black to white; None to keep LibRaw's number.
 
     For LinearRaw DNGs, as phones write them, with a black level for each channel, LibRaw 0.22 does not subtract the
     black level from the white level. White would then be up to 5 % too dark.
@@ -114,14 +115,14 @@ def _full_exposure(raw: Any) -> int | None:
 
 
 def _exif(path: Path) -> bytes | None:
-    """Return the EXIF data of a raw file, None for formats whose EXIF data is not read (CR3)."""
+    """Return the EXIF data of a raw file; None if it has none, or for CR3, whose EXIF data is not read."""
     with open(path, "rb") as file:
         head = file.read(EXIF_SEARCH_BYTES)
         if head.startswith(_FUJI_SIGNATURE):
             place = head[_FUJI_JPEG_OFFSET : _FUJI_JPEG_OFFSET + 4]
             file.seek(int.from_bytes(place, "big"))
             return _exif_of_jpeg(file.read(EXIF_SEARCH_BYTES))
-    if head[:2] in (b"II", b"MM"):  # TIFF; ORF and RW2 differ only in the next two bytes
+    if head[:2] in (b"II", b"MM"):  # a TIFF, or ORF and RW2, which differ in the next two bytes
         return head[:2] + (b"*\0" if head[:2] == b"II" else b"\0*") + head[4:]
     return None
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record of a scene's frame, frame.json: the similarity from the frame that its cameras had first, and what is known.
+"""frame.json, the record of a scene's coordinate frame: the similarity to it from the cameras' original frame.
 
-It lies beside the cameras of a COLMAP model that `clsplat sfm` made, and in the folder of a run.
+The file lies beside the cameras of a COLMAP model that `clsplat sfm` made, and in the folder of a run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from clsplat.files.documents import is_file, parse_json, read_document
 from clsplat.models.edit import decompose
 
 FRAME_RECORD_FILE = "frame.json"
-"""Name of the file in a model's folder and in a run."""
+"""Name of the record's file in the folder of a COLMAP model and in that of a run."""
 MAX_FRAME_RECORD_BYTES = 1 << 20
 """Size limit of frame.json in bytes."""
 _EXPECTED_FRAME_RECORD = "the record of a scene's frame"
@@ -28,13 +28,13 @@ _EXPECTED_FRAME_RECORD = "the record of a scene's frame"
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """The frame of a scene, relative to the frame that its cameras had first ("source": COLMAP's, for example).
+    """The coordinate frame of a scene, relative to the source's: the frame that its cameras had first, as from COLMAP.
 
-    world_from_source: (4, 4) similarity.
+    world_from_source: (4, 4), similarity from the source's frame to the world.
     upright: True if the world's up is -y.
     metres: True if world units are metres.
-    origin: latitude and longitude in degrees and altitude in metres of the world's origin, x east and z north; () if
-        unknown.
+    origin: latitude and longitude in degrees and altitude in metres of the world's origin; () if unknown. If known,
+        the world's x axis points east, and z north.
     up_note, scale_note: what the up direction and the unit come from, for the user; "" if neither was set.
     """
 
@@ -84,7 +84,7 @@ def write_frame(folder: Path, frame: SceneFrame) -> None:
 
 
 def read_frame(folder: Path) -> SceneFrame:
-    """Read frame.json of a folder. Without the file, it is the source's frame. Raises InputError for a damaged file."""
+    """Read frame.json of a folder; SOURCE_FRAME if there is no such file. Raises InputError for a damaged file."""
     path = folder / FRAME_RECORD_FILE
     if not is_file(path):
         return SOURCE_FRAME

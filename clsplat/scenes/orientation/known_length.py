@@ -15,14 +15,14 @@ from clsplat.config.orientation import ScaleRule
 from clsplat.errors import InputError, examples
 
 MIN_LENGTH_SHARE = 1e-12
-"""Smallest distance that counts as a length, relative to the largest coordinate of its ends. Smaller ones are rounding
-of float64 coordinates."""
+"""Smallest distance that counts as a length, relative to the largest coordinate of its ends. A smaller distance may
+be a rounding error of float64 coordinates."""
 
 
 def metres_per_unit(rule: ScaleRule, cameras: Mapping[str, Camera]) -> float:
     """Return the length of a world unit in metres.
 
-    rule: a known length. cameras: by the names of their photographs.
+    rule: a known length, between points or photographs. cameras: by the names of their photographs.
     Raises InputError for unknown names, and for two ends in the same place. Callers put "--scale VALUE: " before the
     message.
     """
@@ -42,9 +42,10 @@ def _distance(ends: Float64, what: str) -> float:
 
 
 def _two_names(text: str, names: list[str]) -> tuple[str, str]:
-    """Split a text at the comma that leaves a photograph's name on both sides. Names may have commas themselves.
+    """Return the two photographs that a text names, with a comma between them. Names may contain commas themselves.
 
     A name without its folder or its extension is enough if it is unique. IMG.heic stands for its copy IMG.heic.jpg.
+    Raises InputError for any other text.
     """
     at = [index for index, character in enumerate(text) if character == ","]
     found = [(_matching(text[:comma], names), _matching(text[comma + 1 :], names)) for comma in at]
@@ -61,7 +62,7 @@ def _two_names(text: str, names: list[str]) -> tuple[str, str]:
 
 
 def _matching(text: str, names: list[str]) -> str | None:
-    """Return the photograph's name that a text stands for; None if there is none or if there are several."""
+    """Return the name of the photograph that a text stands for; None if no photograph fits, or several do."""
     text = text.strip()
     if text in names:
         return text

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New frame of a scene by `--orient` and `--scale`: the change of the world, and its record."""
+"""New coordinate frame of a scene by `--orient` and `--scale`: the similarity of the change, and its record."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from clsplat.scenes.outliers import stray_cameras
 class _Subject:
     """The scene whose frame changes.
 
-    where: its name for messages.
-    cameras: by the images' names, in their order, without outliers.
-    points: (N, 3).
-    files: the photographs with the metadata, by the images' names.
+    where: name of the scene for messages.
+    cameras: by the images' names, in the order of the names, without outliers.
+    points: (N, 3), in the scene's present frame.
+    files: the photographs whose metadata are read, by the images' names.
     turned: as for `new_frame`.
     """
 
@@ -49,7 +49,7 @@ class _Subject:
         return {name: at for name, at in found.items() if at is not None}
 
     def upright(self) -> Upright:
-        """Find up, ground and middle. Raises InputError."""
+        """Find the scene's up direction, ground and middle. Raises InputError if there are too few cameras."""
         known = {name: gravity_of(self.files[name], upright=self.turned) for name in self.cameras if name in self.files}
         gravity = {name: down for name, down in known.items() if down is not None}
         measured = up_from_gravity(self.cameras, gravity) or up_from_gps(self.cameras, self.positions)
@@ -59,7 +59,10 @@ class _Subject:
             raise InputError(f"{self.where}: {error}; use --orient none to keep its axes") from None
 
     def fit_map(self, up: Float64) -> MapFit:
-        """Fit the GPS positions on the map. Warns of positions that are not believed. Raises InputError."""
+        """Fit the cameras to the GPS positions on the map. Warns of wrong positions. Raises InputError.
+
+        up: (3,), unit vector in the world.
+        """
         try:
             fit = fit_map(self.cameras, self.positions, up)
         except InputError as error:
@@ -69,7 +72,10 @@ class _Subject:
         return fit
 
     def metres_per_unit(self, scale: str, rule: ScaleRule) -> float:
-        """Return the length of a world unit by a known length. Raises InputError."""
+        """Return the length of a world unit in metres, from a known length. Raises InputError.
+
+        scale: value of --scale, for messages. rule: the parsed value.
+        """
         try:
             return metres_per_unit(rule, self.cameras)
         except InputError as error:
@@ -79,14 +85,15 @@ class _Subject:
 def new_frame(
     where: object, data: DataSet, files: Mapping[str, Path], use: FrameUse, frame: SceneFrame, *, turned: bool
 ) -> SceneFrame:
-    """Return the frame that a scene gets.
+    """Return the coordinate frame that a scene has after a change.
 
     where: the scene, for messages.
     data: the scene's cameras and points, in its present frame.
     files: the photographs whose metadata are read, by the images' names.
+    use: the change.
     frame: the present frame.
     turned: True if the cameras fit the photographs after their EXIF orientation, False if they fit the stored pixels.
-    Warns of GPS positions that are not believed. Raises InputError if the change cannot be made.
+    Warns of wrong GPS positions. Raises InputError if the change cannot be made.
     """
     by_gps = use.scale == "gps"
     if (use.orient == "up" and frame.upright and not by_gps) or (use.orient == "none" and not frame.upright):
@@ -117,13 +124,13 @@ def new_frame(
         change = scaling(factor) @ change
         known = replace(known, metres=True, scale_note=f"metres are from {note}: a unit was {factor:.6g} m")
     matrix = change @ frame.world_from_source
-    if use.orient == "none":  # free of rounding, so that the frame is exactly the source's
+    if use.orient == "none":  # without rounding errors, so that the axes are exactly the source's
         matrix = scaling(round(decompose(matrix)[0], 12))
     return replace(known, world_from_source=matrix)
 
 
 def _cameras(data: DataSet) -> dict[str, Camera]:
-    """Return the cameras without outliers, by the images' names in their order."""
+    """Return the cameras by the images' names, in the order of the names, without outliers."""
     images = sorted(data.images, key=lambda image: image.name)
     cameras = {image.name: image.lens.camera(image.rotation, image.translation, "undistort") for image in images}
     far = stray_cameras(list(cameras.values()))
@@ -133,11 +140,11 @@ def _cameras(data: DataSet) -> dict[str, Camera]:
 
 
 def in_frame(data: DataSet, change: Float64) -> DataSet:
-    """Return a data set whose world is changed by a similarity (4, 4)."""
+    """Return a data set with its cameras and points moved by a similarity (4, 4)."""
     scale, turn, shift = decompose(change)
     images: list[PosedImage] = []
     for image in data.images:
         rotation = image.rotation @ turn.T
         images.append(replace(image, rotation=rotation, translation=scale * image.translation - rotation @ shift))
-    box = None  # the corners of a box are no box in a turned world
+    box = None  # its sides would not be parallel to the axes of a turned world
     return replace(data, images=images, points=moved(data.points, change), box=box)

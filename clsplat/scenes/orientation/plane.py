@@ -19,18 +19,18 @@ MAX_PLANE_POINTS = 20_000
 MIN_PLANE_POINTS = 30
 """Minimum number of points on a plane."""
 PLANE_TRIALS = 3000
-"""Number of random triples of points that RANSAC tries. With a tenth of the points on the plane, three of them come
-together in one trial of a thousand."""
+"""Number of random triples of points that RANSAC tries. If a tenth of the points are on a plane, one
+trial in a thousand has all three points on it."""
 PLANE_HALF_THICKNESS = 0.01
 """Largest distance of a plane's points from it, relative to the scene's radius."""
 MIN_PLANE_SHARE = 0.1
 """Minimum fraction of the points on the plane. A level slice of a wall has 3 % if the wall is
 30 times as high as the plane is thick."""
 MIN_PLANE_BREADTH = 0.15
-"""Minimum ratio of a plane's two widths (standard deviations of its points). A slice of a wall is a line."""
+"""Minimum ratio of a plane's two widths (standard deviations of its points). A level slice of a wall is a line."""
 PLANE_FIT_WIDTHS = (3.0,) * 10 + (1.0,) * 10
-"""Thickness of a plane in each reweighted fit, as a multiple of the last. The search has the first: on an uneven
-surface, such as a blanket, thin planes through three of its points have all angles within 4 degrees."""
+"""Half thickness of the plane in each reweighted fit, as a multiple of PLANE_HALF_THICKNESS. RANSAC uses the first one,
+because thin planes through points of an uneven surface, such as a blanket, differ by up to 4 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ def level_plane(points: Float64, up: Float64, max_tilt: float, radius: float) ->
     """Find the plane with the most points among planes whose normal is at most `max_tilt` radians from `up` (3,).
 
     points: (N, 3), in the region of interest.
-    radius: of the scene, in world units; the plane's thickness is relative to it.
+    radius: the scene's radius in world units, to which the plane's thickness is relative.
     Returns None if no such plane has enough points, or if the points on it are nearly in a line.
     """
     if len(points) < MIN_PLANE_POINTS:
@@ -71,7 +71,10 @@ def level_plane(points: Float64, up: Float64, max_tilt: float, radius: float) ->
 
 
 def _searched(points: Float64, up: Float64, max_tilt: float, half: float) -> tuple[Float64 | None, float]:
-    """Return the normal and height of the nearly level plane through three points that has the most points near it."""
+    """Return the normal and height of the nearly level plane through three points that has the most points near it.
+
+    half: largest distance of the points that count as near. The normal is None if no trial gave a nearly level plane.
+    """
     rng = np.random.default_rng(0)
     triples = points[rng.integers(len(points), size=(PLANE_TRIALS, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
@@ -89,7 +92,11 @@ def _searched(points: Float64, up: Float64, max_tilt: float, half: float) -> tup
 
 
 def _fitted(points: Float64, normal: Float64, height: float, half: float) -> tuple[Float64, float]:
-    """Fit a plane to the points near it by iteratively reweighted least squares. Returns its normal and height."""
+    """Fit a plane to the points near it by iteratively reweighted least squares. Returns its normal and height.
+
+    normal, height: of the plane to start from.
+    half: half thickness of the plane in the last fit, in world units.
+    """
     for width in PLANE_FIT_WIDTHS:
         off = (points @ normal - height) / (width * half)
         weights = np.square(np.clip(1 - off * off, 0, None))  # Tukey's biweight
@@ -113,9 +120,10 @@ def _is_broad(points: Float64) -> bool:
 def ground_height(heights: Float64, ceiling: float, radius: float) -> float:
     """Return the height of the ground among the heights (N,) of a scene's points.
 
-    It is the lowest level, of the thickness of a plane, with at least a third of the points of the fullest level.
+    It is the lowest layer, as thick as a plane, that has at least a third as many points as the fullest layer.
 
-    ceiling: height above which there is no ground: that of the cameras.
+    ceiling: height of the cameras, below which the ground is searched.
+    radius: the scene's radius, to which a plane's thickness is relative.
     """
     low = heights[heights < ceiling]
     if len(low) < MIN_PLANE_POINTS:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit of a scene's cameras to the GPS positions of its photographs, in metres.
 
-Altitudes of GPS are worse than positions on the map: those of a compact camera drifted by 100 metres in a flight. So
+Altitudes from GPS are less exact than positions on the map: a compact camera's drifted by 100 metres in a flight. So
 scale and north come from a fit on the map, for a known up direction. Up comes from GPS only if the altitudes fit too.
 """
 
@@ -25,14 +25,14 @@ MIN_GPS_PHOTOS = 3
 GPS_FIT_TRIALS = 2000
 """Number of random pairs of photographs that the robust fit on the map tries."""
 GPS_OUTLIER_SIGMAS = 4.0
-"""Positions whose residual is over this many standard deviations are not believed. Of normal errors, 1 in 3000 is."""
+"""Positions are outliers if their residual is over this multiple of sigma: 1.4826 times the median residual. For normal
+errors on the map, the limit is 7 standard deviations along an axis."""
 MAX_GPS_RESIDUAL_SHARE = 0.5
-"""Largest residual (root mean square) relative to the spread of the positions. Over it, the
-positions say little about the cameras."""
+"""Largest residual (root mean square) of a fit that is accepted, relative to the spread of the positions."""
 MAX_GPS_ERROR_METRES = 30.0
-"""Largest error of a position that can be believed in the fit for up. A phone between buildings is 10 to 20 m off."""
+"""Largest error of an inlier in the fit that gives the up direction. A phone between buildings is 10 to 20 m off."""
 MAX_GPS_TILT_RADIANS = np.deg2rad(1.0)
-"""Largest standard error of an up direction from GPS positions with which it is believed."""
+"""Largest standard error, in radians, of an up direction from GPS positions that is used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +41,10 @@ class MapFit:
 
     metres: length of a world unit in metres.
     north: (3,), the direction of north in the world, at a right angle to up.
-    names: photographs whose positions are believed.
-    doubtful: photographs whose positions are not, with the distances in metres.
-    residual: of the believed positions on the map (root mean square), in metres.
-    spread: distance (root mean square) of the positions from their middle, in metres.
+    names: photographs whose positions are used (inliers).
+    doubtful: the other photographs, with the distance in metres of each position from the fitted camera.
+    residual: distance (root mean square) of the inliers from the fitted cameras on the map, in metres.
+    spread: distance (root mean square) of the inliers from their mean, in metres.
     """
 
     metres: float
@@ -64,12 +64,12 @@ class MapFit:
         """The fit in words: number of positions, residual and extent."""
         return (
             f"GPS positions of {len(self.names):,} photographs, which fit within {self.residual:.2g} m on the map over "
-            f"a spread of {self.spread:.3g} m (root mean squares), so to about {100 * self.error:.2g} %"
+            f"a spread of {self.spread:.3g} m (root mean squares), which gives the scale to {100 * self.error:.2g} %"
         )
 
     @property
     def doubt(self) -> str:
-        """A warning that names the photographs whose positions are not believed; "" if all are."""
+        """A warning that names the photographs whose positions are not used; "" if all are used."""
         if not self.doubtful:
             return ""
         named = examples(f"{name} by {metres:,.0f} m" for name, metres in self.doubtful.items())
@@ -109,7 +109,7 @@ def fit_map(cameras: Mapping[str, Camera], positions: Mapping[str, GpsPosition],
         )
     doubtful = {name: float(distances[i]) for i, name in enumerate(names) if not good[i]}
     believed = tuple(name for i, name in enumerate(names) if good[i])
-    north = 1j * np.conj(factor) / abs(factor)  # the direction that the fit turns to north
+    north = 1j * np.conj(factor) / abs(factor)  # the direction in the cameras' world that the fit turns to north
     return MapFit(
         abs(factor), np.asarray(north.real * axes[0] + north.imag * axes[2]), believed, doubtful, residual, spread
     )
@@ -149,9 +149,9 @@ def _robust(
 
 
 def up_from_gps(cameras: Mapping[str, Camera], positions: Mapping[str, GpsPosition]) -> MeasuredUp | None:
-    """Return the up direction of a fit to positions with altitudes; None if they do not fix it to a degree.
+    """Return the up direction of a fit to positions with altitudes; None if they do not give it to within a degree.
 
-    Only of a wide capture, such as a drone's, are the errors of GPS small enough.
+    The errors of GPS are small enough only for a wide capture, such as a drone's.
     """
     import pycolmap
 
@@ -184,8 +184,8 @@ def globe_position(
 ) -> tuple[float, ...]:
     """Return latitude and longitude in degrees and altitude in metres of the world's origin.
 
-    places: camera positions (3,) by name in a world in metres, with x east, y down and z north.
-    Without altitudes, the altitude is that of the ellipsoid, 0.
+    places: camera positions (3,) by the photographs' names, in a world in metres with x east, y down and z north.
+    A position without an altitude counts as on the ellipsoid, at 0 m.
     """
     import pycolmap
 

@@ -23,19 +23,20 @@ MIN_UPRIGHT_CAMERAS = 3
 MAX_PLANE_TILT_RADIANS = np.deg2rad(15.0)
 """Largest angle between a level plane and the cameras' up direction. People hold cameras level to a few degrees."""
 MAX_PLANE_TILT_BELOW_RADIANS = np.deg2rad(30.0)
-"""The same where all cameras look down, whose view directions alone give up."""
+"""The same limit if all cameras look down. Their up direction is less exact, as only their view directions give it."""
 MIN_SAME_VIEW = 0.9
-"""Minimum length of the mean of all view directions if the cameras look in the same direction: 1 if all are equal."""
+"""Minimum length of the mean view direction of cameras that look the same way. It is 1 if all directions are equal."""
 MAX_TURNED_VIEW = 0.5
-"""Maximum length of the mean of the cameras' y axes if they look down: a drone turns around, a person does not."""
+"""Maximum length of the mean y axis of cameras that look down. A drone flies with several headings, so it is short."""
 PLANE_REACH = 2.0
 """Radius within which points are searched for a plane, relative to the scene's radius."""
 MIN_GRAVITY_PHOTOS = 3
-"""Minimum number of photographs whose metadata have gravity."""
+"""Minimum number of photographs with gravity in their metadata, for an up direction from it."""
 MAX_GRAVITY_SPREAD_RADIANS = np.deg2rad(5.0)
 """Largest median angle between the photographs' gravity directions and their mean."""
 MIN_LEVEL_PART = 0.3
-"""Minimum level part of a view direction that gives the heading. A camera that looks more steeply has its y axis."""
+"""Minimum length of a view direction's horizontal part that gives the heading. In a steeper view, the camera's y axis
+gives it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class MeasuredUp:
     """An up direction that does not come from the shape of the scene.
 
     up: (3,), unit vector in the world.
-    note: what it comes from, for the user.
+    note: source of the direction, for the user.
     """
 
     up: Float64
@@ -56,8 +57,8 @@ class Upright:
 
     up: (3,), unit vector.
     origin: (3,), the point on the ground below or above the middle of the scene.
-    ahead: (3,), the direction in which the first camera looks, which becomes the z axis.
-    note: what up comes from, for the user.
+    ahead: (3,), the first camera's heading. Its horizontal part becomes the z axis.
+    note: source of the up direction, for the user.
     plane: the level plane; None if none was found.
     """
 
@@ -68,7 +69,7 @@ class Upright:
     plane: LevelPlane | None
 
     def motion(self, ahead: Float64 | None = None) -> Float64:
-        """Return the rigid motion (4, 4) to the upright frame. ahead: (3,), what becomes z in place of `self.ahead`."""
+        """Return the rigid motion (4, 4) to the upright frame. ahead: (3,), such as north; None for `self.ahead`."""
         rotation = axes_of(self.up, self.ahead if ahead is None else ahead)
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = rotation, -rotation @ self.origin
@@ -80,6 +81,7 @@ def upright(cameras: Sequence[Camera], points: Float64, measured: MeasuredUp | N
 
     cameras: in the order of names; the first one gives the heading.
     points: (N, 3), world coordinates.
+    measured: up direction from gravity or GPS; None to estimate it from the points and the cameras.
     Raises InputError for fewer than MIN_UPRIGHT_CAMERAS cameras.
     """
     if len(cameras) < MIN_UPRIGHT_CAMERAS:
@@ -111,14 +113,18 @@ def _apart(plane: LevelPlane, up: Float64) -> str:
 
 
 def axes_of(up: Float64, ahead: Float64) -> Float64:
-    """Return the rotation (3, 3) to a world whose -y axis is `up` and whose z axis is the level part of `ahead`."""
+    """Return the rotation (3, 3) to a world whose -y axis is `up`, and whose z axis is `ahead` made horizontal."""
     level = ahead - (ahead @ up) * up
     level = level / np.linalg.norm(level)
     return np.stack([np.cross(-up, level), -up, level])
 
 
 def _heading(camera: Camera, up: Float64) -> Float64:
-    """Return the direction (3,) that becomes z: the level part of a camera's view, or its y axis in a steep view."""
+    """Return a camera's heading (3,): the horizontal part of its view direction.
+
+    If the view is steep, the heading is along the camera's y axis. In a view straight down, the top of the picture is
+    ahead.
+    """
     ahead = camera.rotation[2]
     level = ahead - (ahead @ up) * up
     if np.linalg.norm(level) >= MIN_LEVEL_PART:
@@ -127,7 +133,7 @@ def _heading(camera: Camera, up: Float64) -> Float64:
 
 
 def _prior(cameras: Sequence[Camera]) -> tuple[Float64, float, str]:
-    """Return the cameras' up direction (3,), the limit of a plane's angle from it in radians, and its name."""
+    """Return the cameras' up direction (3,), the largest tilt of a plane from it in radians, and its name for notes."""
     if looks_down(cameras):
         forward = np.mean([camera.rotation[2] for camera in cameras], axis=0)
         return -forward / np.linalg.norm(forward), MAX_PLANE_TILT_BELOW_RADIANS, "the cameras, which all look down"
@@ -150,7 +156,8 @@ def middle_of(cameras: Sequence[Camera], points: Float64) -> tuple[Float64, floa
     """Return the middle (3,) and the radius of a scene.
 
     The middle is the point that the cameras look at, and the radius their median distance from it. If they do not look
-    at one point, as in a panorama, it is the cameras' middle, and the radius is the points' median distance from it.
+    at one point, as in a panorama, the middle is the median of their positions. The radius is then the median distance
+    of the points from it.
     """
     centres = np.stack([camera.position for camera in cameras])
     if not any(camera.model.wraps for camera in cameras):

@@ -13,40 +13,42 @@ from clsplat.scenes.video.motion import LOST_MOTION, Measurements
 
 MOTION_PER_FRAME = 0.025
 """Motion between two chosen frames, in longer sides, if the number of frames is not given. A camera that
-circles a still life then gives some 60 frames, as the middle of the scene stays in the middle."""
+circles a still life and keeps it in the middle of the picture then gives some 60 frames."""
 MIN_FRAMES_PER_SECOND = 1.0
 """Smallest number of frames chosen for each second of a moving camera, if the number of frames is not given."""
 MAX_DEFAULT_FRAMES = 300
 """Largest number of frames if it is not given."""
 MOTION_STEP = 0.01
-"""Motion, in longer sides, that counts as one step of the camera. Smaller movements there and back, of a hand that
-holds the camera still, add up to nothing."""
+"""Motion, in longer sides, that counts as one step of the camera. Smaller movements back and forth, as of a hand
+that holds the camera still, do not add up."""
 FAST_SIDES_PER_SECOND = 0.6
 """Motion in longer sides per second up to which a camera is never too fast. A turn of 90 degrees per second of a phone
 has about 1.4."""
 FAST_RATIO = 3.0
-"""Ratio to the median motion of the moving camera, above which a camera is too fast."""
+"""A camera is too fast if its motion is above this multiple of its median while it moves, and above
+FAST_SIDES_PER_SECOND."""
 BLURRED_RATIO = 0.6
-"""A frame is blurred if its sharpness, above that of a smooth picture, is less than this part of its neighbours'."""
+"""A frame is blurred if its detail (sharpness minus SMOOTH_SHARPNESS) is below this fraction of the upper quartile of
+its neighbours' detail."""
 NEIGHBOUR_SECONDS = 1.0
-"""Seconds before and after a frame within which its neighbours are compared with it."""
+"""A frame's neighbours are the frames up to this many seconds before and after it."""
 MAX_ALIKE_RMS_LEVELS, MAX_ALIKE_RMS_PER_GRADIENT = 1.0, 0.2
 """Largest RMS difference of the thumbnails of two frames that are alike: in 255ths, or as a multiple of the RMS
-difference of neighbouring pixels. The larger limit applies. Its second part is a shift by 1/480 of the frame."""
+difference of neighbouring pixels. The larger limit applies. A shift by 1/480 of the longer side reaches the second."""
 SMOOTH_SHARPNESS = 0.25
-"""`thumbnail.sharpness_of` of a picture without any detail."""
+"""`thumbnail.sharpness_of` of a smooth picture, as of a lens out of focus."""
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The chosen frames of a video. F: frames of the video, N: chosen frames, fewer than stretches if some are alike.
+    """The chosen frames of a video. F: frames of the video, N: chosen frames, at most one of each stretch (`choose`).
 
     frames: (N,), indices of the chosen frames in display order.
-    stretches: (F,), number of the stretch of each frame, -1 for fast frames.
+    stretches: (F,), number of the stretch that each frame is in, -1 for fast frames.
     fast: (F,), True for frames during which the camera is too fast.
     blurred: (F,), True for frames that are blurred against their neighbours.
-    travelled: motion of the usable frames in longer sides.
-    wanted: number of frames that was asked for, or that follows from length and motion.
+    travelled: length of the camera's path in longer sides, without fast frames.
+    wanted: number of frames that was asked for, or that follows from the video's length and motion.
     """
 
     frames: NDArray[np.int64]
@@ -61,9 +63,9 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
     """Choose frames of a video. count: number of frames; None for a number by length and motion.
 
     The camera's path is divided into `count` stretches of equal motion, so that a camera that stands still gives one
-    frame. If there are no more usable frames than `count`, each is a stretch. The sharpest frame of each stretch is
-    chosen. It is looked for in the stretch's middle half, if one there is sharper than the stretch's median. Fast,
-    blurred and damaged frames are left out, and of two alike frames in a row the less sharp one.
+    frame. If at most `count` frames are usable, each frame is a stretch. The sharpest frame of each stretch is chosen,
+    or the sharpest in the stretch's middle half if it is sharper than the stretch's median. Fast, blurred and damaged
+    frames are not usable. Of two alike frames in a row, the less sharp one is left out.
     """
     fast, blurred = fast_frames(measured), blurred_frames(measured)
     path = travelled(measured, fast)
@@ -85,13 +87,20 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
 
 
 def default_count(total: float, seconds: float, frames: int) -> int:
-    """Return the number of frames for a path of `total` longer sides and a video of some seconds."""
+    """Return the number of frames to choose from a video.
+
+    total: length of the camera's path in longer sides.
+    seconds, frames: length of the video.
+    """
     by_motion = min(max(total / MOTION_PER_FRAME, seconds * MIN_FRAMES_PER_SECOND), MAX_DEFAULT_FRAMES)
     return int(max(1, min(round(by_motion), frames)))
 
 
 def rates(measured: Measurements) -> Float64:
-    """Return the motion (F,) before or after each frame, whichever is larger, in longer sides per second."""
+    """Return the motion (F,) before or after each frame, whichever is larger, in longer sides per second.
+
+    It is infinite where the blocks of two frames do not match.
+    """
     lengths = np.maximum(np.diff(measured.seconds, prepend=measured.seconds[0] - 1), 1e-3)
     rate = measured.motion / lengths
     rate[measured.motion >= LOST_MOTION] = np.inf
@@ -99,7 +108,7 @@ def rates(measured: Measurements) -> Float64:
 
 
 def fast_frames(measured: Measurements) -> NDArray[np.bool_]:
-    """Return True (F,) for frames during which the camera is too fast."""
+    """Return a mask (F,) of the frames during which the camera is too fast."""
     rate = rates(measured)
     moving = rate[np.isfinite(rate) & (rate > MOTION_STEP)]
     usual = float(np.median(moving)) if len(moving) else 0.0
@@ -107,7 +116,7 @@ def fast_frames(measured: Measurements) -> NDArray[np.bool_]:
 
 
 def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
-    """Return True (F,) for frames that are much less sharp than frames within NEIGHBOUR_SECONDS."""
+    """Return a mask (F,) of the frames that are much less sharp than those within NEIGHBOUR_SECONDS."""
     detail = measured.sharpness - SMOOTH_SHARPNESS
     first = np.searchsorted(measured.seconds, measured.seconds - NEIGHBOUR_SECONDS)
     last = np.searchsorted(measured.seconds, measured.seconds + NEIGHBOUR_SECONDS, side="right")
@@ -118,8 +127,10 @@ def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
 def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
     """Return the length (F,) of the camera's path up to each frame, in longer sides, without fast frames.
 
-    The path has steps of at least MOTION_STEP: the motion of each block is summed as a vector, until the mean length of
-    the sums reaches a step. Movements there and back in a step lengthen the path only once.
+    The path has steps of at least MOTION_STEP: each block's motion vectors are summed, until the mean length of the
+    blocks' sums reaches MOTION_STEP. Movements back and forth within a step lengthen the path only once.
+
+    fast: (F,), mask of the fast frames.
     """
     path, done, step = np.zeros(len(measured)), 0.0, np.zeros_like(measured.flow[0])
     for index in range(1, len(measured)):
@@ -137,8 +148,9 @@ def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
 
 
 def _sharpest(sharpness: Float64, path: Float64, inside: NDArray[np.int64], usable: NDArray[np.bool_]) -> int | None:
-    """Return the usable frame of a stretch to choose, None if there is none.
+    """Return the index of the frame to choose from a stretch, as `choose` describes; None if no frame is usable.
 
+    sharpness, path, usable: (F,), of all frames; path is the result of `travelled`.
     inside: indices of the stretch's frames.
     """
     able = inside[usable[inside]]
@@ -155,7 +167,7 @@ def _sharpest(sharpness: Float64, path: Float64, inside: NDArray[np.int64], usab
 
 
 def unlike(chosen: list[int], measured: Measurements) -> list[int]:
-    """Return the chosen frames without those that look like the one before; of two alike ones the sharper is kept."""
+    """Return the indices of the chosen frames, with only the sharper of two alike frames in a row."""
     kept: list[int] = []
     for index in chosen:
         if kept and alike(measured.thumbnails[kept[-1]], measured.thumbnails[index]):

@@ -21,9 +21,9 @@ REFERENCE_WHITE_NITS = 203.0
 """Luminance in cd/m^2 of diffuse white in HLG and PQ (BT.2408, table 1). It is the linear value 1 before highlights are
 compressed."""
 HDR_PEAK_NITS = 1000.0
-"""Luminance in cd/m^2 of the brightest HDR value that is told from brighter ones: HLG's nominal peak in BT.2100."""
+"""Luminance in cd/m^2 that becomes white, as all brighter values do: HLG's nominal peak in BT.2100."""
 HIGHLIGHT_KNEE = 0.6
-"""Linear value up to which light is kept. From there to the peak, highlights are compressed to 1."""
+"""Linear value up to which light stays unchanged. Higher values, up to the peak, are compressed to 1 at most."""
 HLG_SYSTEM_GAMMA = 1.2
 """Exponent of HLG's opto-optical transfer function for a display of 1000 cd/m^2 (BT.2100, table 5)."""
 SDR_DISPLAY_GAMMA = 2.4
@@ -39,25 +39,29 @@ LUMA_WEIGHTS_BY_MATRIX = {
     9: (0.2627, 0.6780, 0.0593),
     10: (0.2627, 0.6780, 0.0593),
 }
-"""Weights of red, green and blue in luma, by H.273's number of the matrix: Rec.709, FCC, Rec.601 twice, SMPTE 240M and
-BT.2020 twice."""
+"""Weights of red, green and blue in luma, by the number of the matrix in H.273: Rec.709, FCC, Rec.601 twice, SMPTE
+240M and BT.2020 twice."""
 _REC2020_TO_REC709 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]], np.float32
 )
-"""Linear Rec.709 from BT.2020 (BT.2087, equation 5)."""
+"""Matrix to linear Rec.709 from linear BT.2020 (BT.2087, equation 5)."""
 _P3_TO_REC709 = np.array(
     [[1.224940, -0.224940, 0.0], [-0.042057, 1.042057, 0.0], [-0.019638, -0.078636, 1.098274]], np.float32
 )
-"""Linear Rec.709 from Display P3 (SMPTE EG 432-1, white D65)."""
+"""Matrix to linear Rec.709 from linear Display P3 (SMPTE EG 432-1, white D65)."""
 _MATRIX_TO_REC709 = {9: _REC2020_TO_REC709, 12: _P3_TO_REC709}
 CURVE_TABLE_ENTRIES = 1 << 16
-"""Entries of a tabulated curve. Where sRGB's curve is steepest, two entries are 0.05 levels of 255 apart."""
+"""Entries of a tabulated curve. Where sRGB's curve is steepest, neighbouring entries differ by 0.05/255."""
 _ROWS = 64
 
 
 @dataclass(frozen=True)
 class Coding:
-    """Coding of a video's pixels: H.273's numbers of matrix, primaries and transfer, and True for full range."""
+    """Coding of a video's pixels.
+
+    matrix, primaries, transfer: numbers of the luma matrix, the primaries and the transfer function in H.273.
+    full_range: True if luma uses all values, False if it has black at 16 and white at 235 (for 8 bits).
+    """
 
     matrix: int
     primaries: int
@@ -77,7 +81,7 @@ class Coding:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """Luma (H, W) and chroma of a frame, at full or half width and height. bits: bits of a value."""
+    """Luma (H, W) and chroma of a frame. Chroma has full or half width and height. bits: bits per value."""
 
     y: NDArray[Any]
     cb: NDArray[Any]
@@ -86,9 +90,10 @@ class Planes:
 
 
 def display_rgb(planes: Planes, coding: Coding, quarter_turns: int = 0) -> NDArray[np.uint8]:
-    """Return a frame (H, W, 3) in the space of photographs, turned counter-clockwise by quarter turns.
+    """Return a frame (H, W, 3) in the space of photographs, turned counter-clockwise by `quarter_turns`.
 
-    Chroma of half width is sited at the left, as in H.264 and HEVC, and interpolated linearly.
+    Chroma of half width is interpolated linearly. A chroma sample lies on the left one of two luma samples, as in H.264
+    and HEVC.
     """
     height, width = planes.y.shape
     pixels = np.empty((height, width, 3), np.uint8)
@@ -101,7 +106,7 @@ def display_rgb(planes: Planes, coding: Coding, quarter_turns: int = 0) -> NDArr
 
 
 def _widened(plane: NDArray[Any], width: int) -> Float32:
-    """Interpolate chroma, sited left, to the width of luma; chroma of full width is only converted."""
+    """Return chroma as floats, interpolated to the width of luma. Samples of half width lie on even columns."""
     values = plane.astype(np.float32)
     if plane.shape[1] == width:
         return values
@@ -113,7 +118,10 @@ def _widened(plane: NDArray[Any], width: int) -> Float32:
 
 
 def _signal(planes: Planes, chroma: list[Float32], rows: slice, coding: Coding) -> Float32:
-    """Return the non-linear R'G'B' (rows, W, 3), nominally in [0, 1], by H.273's equations of matrix and range."""
+    """Return the non-linear R'G'B' of some rows, nominally in [0, 1], by H.273's equations of matrix and range.
+
+    chroma: Cb and Cr at the width of luma, and at its height or half of it.
+    """
     unit = 2.0 ** (planes.bits - 8)
     largest = 2**planes.bits - 1
     scale_y, scale_c = (largest, largest) if coding.full_range else (219 * unit, 224 * unit)
@@ -134,7 +142,7 @@ def _signal(planes: Planes, chroma: list[Float32], rows: slice, coding: Coding) 
 
 
 def _heightened(plane: Float32, rows: slice) -> Float32:
-    """Return rows of luma's height from chroma of half the height, sited between two rows of luma."""
+    """Interpolate chroma of half height to some rows of luma. A row of chroma lies midway between two rows of luma."""
     at = np.arange(rows.start, rows.stop)
     near = np.minimum(at // 2, len(plane) - 1)
     far = np.clip(np.where(at % 2 == 0, near - 1, near + 1), 0, len(plane) - 1)
@@ -142,7 +150,7 @@ def _heightened(plane: Float32, rows: slice) -> Float32:
 
 
 def _encoded(rgb: Float32, coding: Coding) -> NDArray[np.uint8]:
-    """Convert R'G'B' of a coding to display values of 8 bits."""
+    """Convert a video's non-linear R'G'B' to 8-bit display values of Rec.709 primaries."""
     matrix = _MATRIX_TO_REC709.get(9 if coding.is_hdr and coding.primaries == 2 else coding.primaries)
     if coding.is_hdr:
         light = display_light(rgb, coding.transfer)
@@ -168,14 +176,16 @@ def display_light(signal: Float32, transfer: int) -> Float32:
 
 
 def _looked_up(table: NDArray[Any], values: Float32) -> NDArray[Any]:
-    """Return the entries of a table over [0, 1] that are nearest to the values, which are clipped to that range."""
+    """Clip values to [0, 1], and return the nearest entries of a table that covers this range evenly."""
     last = np.float32(len(table) - 1)
     return np.asarray(table[(np.clip(values, 0, 1) * last + np.float32(0.5)).astype(np.intp)])
 
 
 @lru_cache(maxsize=2)
 def _light_table(transfer: int) -> Float32:
-    """Return light at equidistant signals in [0, 1]: HLG's scene light in [0, 1], or PQ's multiples of white.
+    """Return linear light at equidistant signals in [0, 1].
+
+    For HLG it is scene light in [0, 1], for PQ display light in multiples of REFERENCE_WHITE_NITS.
 
     BT.2100, table 4 for PQ (the EOTF) and table 5 for HLG (the inverse OETF).
     """
@@ -191,7 +201,7 @@ def _light_table(transfer: int) -> Float32:
 
 
 def compressed(light: Float32) -> Float32:
-    """Compress highlights of linear light (..., 3): values to HIGHLIGHT_KNEE stay, the peak becomes 1.
+    """Compress highlights of linear light (..., 3): values up to HIGHLIGHT_KNEE stay, HDR_PEAK_NITS becomes 1.
 
     All three channels are scaled by the factor of the largest one, which keeps the hue. The curve is the hyperbola that
     continues the line y = x with the same slope at the knee (FFmpeg's tonemap calls the curve Möbius).

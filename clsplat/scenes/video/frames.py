@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of videos as photographs on the disk (`take_frames`), with a table of their times and of what was measured."""
+"""Frames of videos as photographs on the disk (`take_frames`), with a table of their times and measurements."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ FRAME_TABLE_FILE = "frames.json"
 FRAME_TABLE_VERSION = 1
 """Version of the table and of the choice of frames. Frames of another version are not used again."""
 FRAME_JPEG_QUALITY = 97
-"""JPEG quality of the frames, without subsampling of chroma."""
+"""JPEG quality of the frames. Their chroma is not subsampled."""
 MIN_TEXTURED_FRACTION = 0.1
-"""Fraction of the frames' blocks, on average, that must have texture; a video with less shows a wall or is black."""
+"""Smallest fraction of textured blocks, on average over all frames. A video with less shows a wall or is black."""
 MIN_DECODED_FRACTION = 0.9
-"""Fraction of the frames that the header announces. If fewer decode, the file counts as cut off."""
+"""Smallest fraction of the frames announced in the header that must decode. With fewer, the file counts as cut off."""
 
 
 @dataclass(frozen=True)
 class FramesOfVideo:
     """Frames taken from one video.
 
-    video: name of the video, by its path below the folder of the videos.
+    video: path of the video below the folder of the videos.
     names: paths of the frames below the folder of the frames, in display order.
     preview: report on the capture.
     """
@@ -81,12 +81,13 @@ def take_frames(
     """Choose frames of videos, and write them as photographs to the folder `output`.
 
     A frame's name is that of its video's file, followed by the number of the frame: walk.mp4/000123.jpg. The frames are
-    upright and in the space of photographs. The same video gives the same bytes and modification times, which are the
-    video's. An existing folder with the frames of the same videos and the same `count` is used again.
+    upright, with the colours of photographs (`display_rgb`). The same videos give the same bytes again, and the
+    modification times of the videos. An existing folder with the frames of the same videos and the same `count` is used
+    again.
 
     Each video is decoded twice: once for the choice, which depends on the whole video, and once for the chosen frames.
 
-    root: folder below which the videos are named; by default the folder of the first one.
+    root: folder below which the videos are named; by default the first video's folder.
     count: number of frames of each video; None for a number by the video's length and motion.
     overwrite: replace frames of other videos, or of another count.
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
@@ -123,7 +124,7 @@ def take_frames(
 def frame_sequences(folder: Path) -> list[list[str]]:
     """Return the frames' names in display order, a list for each video, by the table of a folder of frames.
 
-    The result is empty for a folder without a table, or if the file of that name is another program's. Frames that no
+    The list is empty for a folder without a table, or with another program's file of the table's name. Frames that no
     longer exist are left out.
     """
     try:
@@ -149,7 +150,7 @@ def _table(folder: Path) -> dict[str, Any]:
 
 
 def _is_table(table: dict[str, Any]) -> bool:
-    """Return True if a JSON object has the parts of a table of frames that are used."""
+    """Return True if a JSON object has those parts of a table of frames that clsplat reads."""
     rows = table.get("videos")
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         return False
@@ -174,9 +175,10 @@ def _from_table(folder: Path, table: dict[str, Any]) -> TakenFrames:
 
 
 def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool) -> TakenFrames | None:
-    """Return the frames in the output if they are of the same videos and counts, None if they have to be taken.
+    """Return the frames in the output if they are of the same videos and counts; None if frames have to be taken.
 
-    Raises InputError for any other output that must not be replaced.
+    wanted: name, SHA-256 and number of frames of each video, as in the table.
+    Raises InputError for an output with anything else, unless it holds frames and `overwrite` is True.
     """
     if not output.exists():
         return None
@@ -194,7 +196,7 @@ def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool
     if same and not changed and table.get("version") == FRAME_TABLE_VERSION:
         return _from_table(output, table)
     if not overwrite:
-        why = "has the frames of other videos, or of another number"
+        why = "has frames of other videos, or another number of frames"
         if same:
             why = (
                 f"{examples(changed)} were removed or changed" if changed else "was made by another version of clsplat"
@@ -211,7 +213,11 @@ def _size(path: Path) -> int:
 
 
 def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress: Progress) -> dict[str, Any]:
-    """Write the chosen frames of one video below `folder`. Returns the video's part of the table."""
+    """Write the chosen frames of one video below `folder`. Returns the video's part of the table.
+
+    name: path of the video below the folder of the videos.
+    count: number of frames; None for a number by the video's length and motion.
+    """
     with open_video(path) as reader:
         measured, numbers, turns = measure_video(reader, lambda done: progress(f"reading {name}", done))
         facts = reader.facts.turned(turns)
@@ -219,7 +225,8 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
     choice = choose(measured, count)
     if not len(choice.frames):
         raise InputError(
-            f"{path}: none of its {len(measured):,} frames is sharp and undamaged, expected a slower camera"
+            f"{path}: all of its {len(measured):,} frames are blurred, damaged or of a fast camera, expected a slower "
+            "camera"
         )
     told = preview(facts, measured, choice)
     progress(f"{name}: {told.text}", None)
@@ -236,9 +243,11 @@ def _frames_of(path: Path, name: str, folder: Path, count: int | None, progress:
 
 
 def measure_video(reader: VideoReader, report: Callable[[float], None]) -> tuple[Measurements, list[int], int]:
-    """Measure all frames. Returns the measurements, the number of each measured frame, and the frames' quarter turns.
+    """Measure all frames of a video, except frames whose size differs from the first frame's.
 
-    Frames of another size than the first one's are left out.
+    report: function that is called with the fraction of the video that is done.
+    Returns the measurements, the number of each measured frame in display order, and the quarter turns of
+    `VideoFrame.quarter_turns`. Raises InputError if no frame decodes.
     """
     coding, meter, shape = reader.facts.coding, None, (0, 0)
     numbers: list[int] = []
@@ -289,7 +298,12 @@ def _write(
     turns: int,
     report: Callable[[float], None],
 ) -> None:
-    """Decode a video up to the last chosen frame, and write the chosen frames. files: names by number of the frame."""
+    """Decode a video up to the last chosen frame, and write the chosen frames.
+
+    files: paths of the chosen frames below `folder`, by the frames' numbers.
+    turns: counter-clockwise quarter turns that bring the frames upright.
+    report: function that is called with the fraction that is done.
+    """
     last = max(files)
     waiting: deque[Future[None]] = deque()
     workers = min(4, os.cpu_count() or 1)
@@ -299,7 +313,7 @@ def _write(
             for frame in reader.frames():
                 if frame.index in files:
                     waiting.append(pool.submit(_write_frame, frame, facts, turns, folder / files[frame.index]))
-                while len(waiting) > workers:  # each holds a decoded frame
+                while len(waiting) > workers:  # each future holds a decoded frame in memory
                     waiting.popleft().result()
                     done += 1
                     report(done / len(files))
@@ -321,7 +335,7 @@ def _write_frame(frame: VideoFrame, facts: VideoFacts, turns: int, path: Path) -
 
 
 def write_frame(path: Path, pixels: NDArray[np.uint8], make: str = "", model: str = "") -> None:
-    """Write a frame (H, W, 3) as a JPEG, with make and model of the camera. Raises ClsplatError if writing fails."""
+    """Write a frame (H, W, 3) as a JPEG, with the camera's make and model. Raises ClsplatError if writing fails."""
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     spec.attribute("Compression", f"jpeg:{FRAME_JPEG_QUALITY}")
     spec.attribute("jpeg:subsampling", "4:4:4")
@@ -332,7 +346,7 @@ def write_frame(path: Path, pixels: NDArray[np.uint8], make: str = "", model: st
 
 
 def _described(facts: VideoFacts, turns: int) -> dict[str, Any]:
-    """Return a video's facts for the table; facts that the file lacks are left out."""
+    """Return a video's facts for the table, without facts that the file lacks. turns: quarter turns of the frames."""
     optional = {"place": list(facts.place), "time": facts.time, "make": facts.make, "model": facts.model}
     return {
         "width": facts.width,
@@ -351,9 +365,10 @@ def _told(told: Preview) -> dict[str, Any]:
 def _listed(
     folder: Path, files: dict[int, str], measured: Measurements, choice: Choice, numbers: list[int]
 ) -> dict[str, Any]:
-    """Return the chosen frames for the table.
+    """Return the number of measured frames, and the entries of the chosen frames, for the table.
 
-    numbers: number of each measured frame.
+    files: paths of the chosen frames below `folder`, by the frames' numbers.
+    numbers: number of each measured frame in display order.
     """
     frames = [
         {

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements on the frames of a video: sharpness, brightness, and motion from frame to frame by blocks.
+"""Measurements on the frames of a video: sharpness, brightness, and the motion of each block from frame to frame.
 
 Motion is measured by phase correlation of square blocks (Kuglin and Hines 1975). Lengths are fractions of the frame's
-longer side, so that they do not depend on its size.
+longer side, so that they do not depend on the number of pixels. Texts call this unit "longer sides".
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ BLOCK_COLUMNS, BLOCK_ROWS = 4, 3
 MIN_BLOCK_CONTRAST = 2.5 / 255
 """Standard deviation, of values in [0, 1], below which a block has no texture that could be matched."""
 MIN_CORRELATION_PEAK = 0.17
-"""Smallest peak of the phase correlation, 1 for equal blocks, of a match that counts. Of unrelated blocks of 64 pixels,
-1 in 1000 has a higher peak. The limit of smaller blocks is higher, as the inverse of their side."""
+"""Smallest peak of the phase correlation of two blocks that match; equal blocks have 1. Of unrelated blocks with a side
+of 64 pixels, 1 in 1000 has a higher peak. For smaller blocks the limit rises in inverse proportion to the side."""
 LOST_MOTION = 0.2
 """Motion, in longer sides, that is assumed between two frames whose textured blocks do not match."""
 _LOW_PASS_CYCLES = 0.2
@@ -41,7 +41,7 @@ def reduced_luma(luma: NDArray[np.unsignedinteger[Any]], side: int) -> NDArray[n
 
 
 def _summed(image: NDArray[Any], factor: int, dtype: type[np.generic]) -> NDArray[Any]:
-    """Sum an image (H, W) over squares of `factor` pixels a side, without the rest at its right and lower edges.
+    """Sum an image (H, W) over squares of `factor` x `factor` pixels. Incomplete squares at the edges are left out.
 
     Slices are added one by one, because NumPy's sums over short axes take several times as long.
     """
@@ -66,7 +66,7 @@ class Measurements:
     brightness: (F,), mean luma in [0, 1].
     textured: (F,), fraction of the blocks with texture.
     flow: (F, B, 2), motion x, y of each block since the frame before, in longer sides; NaN for blocks without a match.
-    motion: (F,), mean length of the flow; LOST_MOTION if textured blocks do not match; 0 for the first frame.
+    motion: (F,), mean length of the flow; LOST_MOTION if most textured blocks do not match; 0 for the first frame.
     places: (B, 2), centres of the blocks, in longer sides from the frame's centre.
     thumbnails: (F, h, w) uint8.
     """
@@ -89,7 +89,7 @@ class Measurements:
 class Meter:
     """Measures frames one after the other, in display order.
 
-    black, white: luma of black and white, as stored.
+    black, white: the stored luma of black and of white.
     """
 
     black: float
@@ -100,7 +100,12 @@ class Meter:
     _last: BlockSpectra | None = None
 
     def add(self, luma: NDArray[Any], seconds: float, *, whole: bool) -> None:
-        """Measure a frame. luma: (H, W), as stored; all frames have one size."""
+        """Measure a frame.
+
+        luma: (H, W), as stored; all frames have the same size.
+        seconds: time since the first frame.
+        whole: False if the decoder concealed errors in the frame.
+        """
         sums = reduced_luma(luma, SHARPNESS_SIDE_PX)
         per_pixel = (-(-max(luma.shape) // SHARPNESS_SIDE_PX)) ** 2
         scale = np.float32(1 / ((self.white - self.black) * per_pixel))
@@ -113,7 +118,7 @@ class Meter:
         self._thumbnails.append(np.rint(255 * _averaged(grey, THUMBNAIL_SIDE_PX)).astype(np.uint8))
 
     def measurements(self) -> Measurements:
-        """Return the measurements on the frames so far, of which there is at least one."""
+        """Return the measurements on all frames added so far. There must be at least one."""
         assert self._last is not None
         seconds, whole, sharpness, brightness, textured = (np.array(column) for column in zip(*self._rows, strict=True))
         flow = np.stack(self._flows)
@@ -131,7 +136,10 @@ def _averaged(grey: Float32, side: int) -> Float32:
 
 
 def _motion(flow: Float64, textured: Float64) -> Float64:
-    """Return the mean motion of the matched blocks of each frame; LOST_MOTION if under a quarter of them match."""
+    """Return the mean motion (F,) of each frame's matched blocks; LOST_MOTION if under a quarter of the textured match.
+
+    flow, textured: as in Measurements.
+    """
     lengths = np.linalg.norm(flow, axis=2)
     matched = np.isfinite(lengths)
     mean = np.where(matched, lengths, 0).sum(axis=1) / np.maximum(matched.sum(axis=1), 1)
@@ -154,13 +162,16 @@ def _grid(height: int, width: int) -> tuple[int, tuple[tuple[int, int], ...]]:
 
 @lru_cache(maxsize=4)
 def _windows(side: int) -> tuple[Float32, Float32]:
-    """Return the window (side, side) of a block, and the weights (side, side / 2 + 1) of its frequencies, of sum 1."""
+    """Return the window (side, side) of a block, and the weights (side, side / 2 + 1) of its frequencies.
+
+    Over the full spectrum, with the frequencies that a real transform leaves out, the weights sum to 1.
+    """
     hann = np.hanning(side + 2)[1:-1]
     squared = fft.fftfreq(side)[:, None] ** 2 + fft.rfftfreq(side)[None] ** 2
     weights = np.exp(-0.5 * squared / _LOW_PASS_CYCLES**2)
     weights[0, 0] = 0  # the mean brightness does not move
     both = weights.copy()
-    both[:, 1 : side // 2] *= 2  # the frequencies that a real transform leaves out
+    both[:, 1 : side // 2] *= 2  # count also for the conjugate frequencies, which a real transform leaves out
     return np.outer(hann, hann).astype(np.float32), (weights / both.sum()).astype(np.float32)
 
 
@@ -217,7 +228,9 @@ class BlockSpectra:
 
 
 def _vertex(left: Float32, middle: Float32, right: Float32) -> Float64:
-    """Return the offset, in pixels, of the vertex of a Gaussian through three neighbouring values; 0 if there is none.
+    """Return the offset in pixels from `middle` to the peak of a Gaussian through three neighbouring values.
+
+    It is 0 if the values have no peak.
 
     The correlation of two shifted blocks is a Gaussian, because its frequencies have Gaussian weights.
     """

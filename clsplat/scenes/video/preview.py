@@ -15,13 +15,13 @@ from clsplat.scenes.video.motion import Measurements
 from clsplat.scenes.video.reading import VideoFacts
 
 MAX_FAST_FRACTION = 0.1
-"""Fraction of the frames during which a camera may be too fast without advice."""
+"""Largest fraction of fast frames for which no advice is given."""
 DARK_LUMA = 0.15
 """Median of the frames' mean luma, in [0, 1], below which a video is too dark."""
 SOFT_DETAIL = 0.05
-"""Median of the chosen frames' sharpness, above that of a smooth picture, below which a video is soft."""
+"""Detail below which a video is soft: the median sharpness of the chosen frames minus SMOOTH_SHARPNESS."""
 MIN_PARALLAX = 0.06
-"""Parallax (`parallax_of`) below which a camera turns rather than moves.
+"""Parallax (`parallax_of`) below which a camera only turns, and its place hardly changes.
 
 In the demo's scene, a camera that turns on the spot has 0.04, and one that flies over the flat floor 0.07. One that
 walks sideways or around the scene has 0.45 to 0.8.
@@ -30,12 +30,12 @@ MIN_TRAVELLED = 0.1
 """Length of the camera's path, in longer sides, below which a video hardly shows different viewpoints. A walk of 60
 degrees around the demo's scene has 0.2."""
 ASSUMED_FOCAL = 0.8
-"""Focal length in longer sides by which the motion of a turning camera is told from that of a moving one: a phone's."""
+"""Focal length in longer sides, as of a phone, that `rotation_field` assumes."""
 
 
 @dataclass(frozen=True)
 class Preview:
-    """Report on a video. text: one line of facts. advice: lines on what to do better, empty for a good capture."""
+    """Report on a video. text: one line of facts. advice: lines on how to capture better; empty for a good video."""
 
     text: str
     advice: tuple[str, ...]
@@ -102,7 +102,10 @@ def parallax_of(measured: Measurements, choice: Choice) -> float:
 
 
 def rotation_field(places: Float64) -> Float64:
-    """Return the motion (B, 2, 3) at places (B, 2) for small rotations about the camera's axes x, y and z."""
+    """Return the motion x, y at each place (B, 2, 3) for a small rotation about each of the camera's axes x, y and z.
+
+    places: (B, 2), in longer sides from the frame's centre. The motion is in longer sides per radian.
+    """
     x, y, focal = places[:, 0], places[:, 1], ASSUMED_FOCAL
     across = np.stack([x * y / focal, -(focal + x**2 / focal), y], axis=-1)
     down = np.stack([focal + y**2 / focal, -x * y / focal, -x], axis=-1)

@@ -22,9 +22,9 @@ VIDEO_INPUT_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts",
 """Lower-case extensions of the videos that a search in folders finds, and that may be given in place of a folder."""
 VIDEO_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
 """FFmpeg's names of the containers that are read. Playlists are not among them, because they name other files or
-addresses in the network."""
+network addresses."""
 SD_HEIGHT_PX = 576
-"""Largest height in pixels of a video whose colours are Rec.601 if the file does not name a matrix."""
+"""Shorter side in pixels up to which a video's luma matrix is taken as Rec.601 if the file does not name one."""
 MIN_VIDEO_SIDE_PX = 32
 """Smallest side in pixels of a video whose motion can be measured."""
 MAX_VIDEO_PIXELS = 1 << 27
@@ -41,7 +41,7 @@ _PLANAR = re.compile(r"yuvj?(420|422|444)p(?:(10|12|16)le)?\Z")
 
 
 def is_video_name(path: Path) -> bool:
-    """Return True if the extension is that of a video."""
+    """Return True if the extension is one of VIDEO_INPUT_SUFFIXES."""
     return path.suffix.lower() in VIDEO_INPUT_SUFFIXES
 
 
@@ -49,13 +49,14 @@ def is_video_name(path: Path) -> bool:
 class VideoFacts:
     """Facts from the header of a video.
 
-    width, height: size in pixels, as stored or as `turned` says.
+    width, height: size in pixels of the stored pictures, or of the upright ones in the result of `turned`.
     seconds: length by the header; None if the header does not have it.
     frames: number of frames by the header; 0 if the header does not have it.
     codec: FFmpeg's name of the codec.
     coding: how the pixels are coded.
     place: latitude and longitude in degrees, and altitude in metres if it is known; empty if the file has no place.
-    time, make, model: time of the recording and the camera, as text of the file; empty if the file lacks them.
+    time: when the video was recorded, as text of the file; "" if the file lacks it.
+    make, model: the camera's, as text of the file; "" if the file lacks them.
     """
 
     width: int
@@ -80,10 +81,11 @@ class VideoFacts:
 class VideoFrame:
     """A decoded frame.
 
-    index: its number in display order, from 0.
-    seconds: its time since the first frame.
+    index: number of the frame in display order, from 0.
+    seconds: time since the first frame.
     quarter_turns: number of counter-clockwise quarter turns that bring the stored picture upright.
     whole: False if the decoder had to conceal errors.
+    raw: PyAV's frame.
     """
 
     index: int
@@ -93,7 +95,7 @@ class VideoFrame:
     raw: Any
 
     def planes(self) -> Planes:
-        """Return luma and chroma as stored, as views of the decoder's memory; valid as long as this frame."""
+        """Return luma and chroma as stored: views of the decoder's memory, which are valid while this frame exists."""
         return _planes(self.raw)
 
     def luma(self) -> np.ndarray[Any, Any]:
@@ -103,7 +105,7 @@ class VideoFrame:
 
 @dataclass
 class VideoReader:
-    """A video that is open for reading. `trouble` lists the decoder's complaints about damaged parts."""
+    """A video that is open for reading. `trouble` lists what was found damaged, for messages."""
 
     path: Path
     facts: VideoFacts
@@ -155,11 +157,11 @@ def open_video(path: Path) -> Iterator[VideoReader]:
     kinds = " ".join(VIDEO_INPUT_SUFFIXES)
     with open_input(path, "a video") as file:
         try:
-            # an open file in place of its name: FFmpeg would take some names for addresses or patterns
+            # the open file, not its name, because FFmpeg takes some names for network addresses or patterns
             container = av.open(file, metadata_errors="replace", options={"format_whitelist": VIDEO_CONTAINERS})
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise InputError(
-                f"{path}: cannot be read as a video ({_reason(error)}), expected a whole file of a kind among {kinds}"
+                f"{path}: cannot be read as a video ({_reason(error)}), expected a complete file of a kind in {kinds}"
             ) from None
         with container:
             streams = [stream for stream in container.streams.video if not _is_cover(stream)]
@@ -171,7 +173,7 @@ def open_video(path: Path) -> Iterator[VideoReader]:
 
 
 def _prepared(path: Path, stream: Any) -> Any:
-    """Check a stream's codec and size, and let the decoder use all cores. Returns the stream."""
+    """Check a video stream's codec and size, and let its decoder use all cores. Returns the stream."""
     context = stream.codec_context
     if context is None:
         raise InputError(f"{path}: has a codec that PyAV does not decode, expected H.264, HEVC, AV1, VP9 or ProRes")
@@ -189,7 +191,7 @@ def _prepared(path: Path, stream: Any) -> Any:
 
 
 def _is_cover(stream: Any) -> bool:
-    """Return True for a still picture, such as the cover of a sound file."""
+    """Return True if a video stream is a still picture, such as the cover of a sound file."""
     disposition = getattr(stream, "disposition", 0)
     return bool(int(getattr(disposition, "value", disposition)) & 0x400)
 
@@ -225,7 +227,7 @@ def _first(known: dict[str, str], keys: tuple[str, ...]) -> str:
 
 
 def parse_place(text: str) -> tuple[float, ...]:
-    """Return latitude, longitude and, if given, altitude of a place in ISO 6709's form; empty for another text.
+    """Parse latitude, longitude and, if given, altitude from a text as in ISO 6709. Empty for any other text.
 
     Phones write degrees with decimals, as in +48.8577+002.2950+035.000/.
     """
@@ -253,10 +255,10 @@ def _coding(context: Any) -> Coding:
 
 
 def _seconds(raw: Any, last: float | None, stream: Any) -> float:
-    """Return a frame's time, which never falls.
+    """Return the time in seconds of PyAV's frame `raw`. Times never fall.
 
-    A frame without a time, or with an earlier one, follows the last frame by the stream's frame duration. Times begin
-    anew in files that were joined, as cameras' .mts files often are.
+    A frame without a time, or with an earlier one than `last`, is one frame duration after `last`. Times begin anew in
+    files that were joined, as cameras' .mts files often are.
 
     last: time of the frame before; None for the first frame.
     """
@@ -268,7 +270,7 @@ def _seconds(raw: Any, last: float | None, stream: Any) -> float:
 
 
 def _quarter_turns(raw: Any) -> int:
-    """Return the counter-clockwise quarter turns of the file's display matrix; angles between are rounded."""
+    """Return the counter-clockwise quarter turns in the file's display matrix, whose angle is rounded to them."""
     return int(round(raw.rotation / 90) % 4)
 
 
