@@ -46,7 +46,7 @@ VISUAL_WORDS = 64
 RETRIEVAL_FEATURES = 1000
 """Number of features in a photograph, the largest first, that `image_similarity` uses."""
 CLUSTERED_EVERY, CLUSTERING_ROUNDS = 5, 10
-"""The visual words are clusters of every fifth of these features, from this number of rounds of k-means."""
+"""`image_similarity` clusters every fifth of these features, in ten rounds of k-means."""
 
 
 def chosen_matching(matching: str, count: int, sequences: Sequence[Sequence[int]], positions: NDArray[Any]) -> str:
