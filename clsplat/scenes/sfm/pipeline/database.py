@@ -115,8 +115,8 @@ def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
 def feature_evidence(database: Path) -> dict[str, Any]:
     """Return counts of features and matches, for the message about a failed reconstruction.
 
-    Keys: "features" is the median of the photographs, "pairs" the number of pairs that were tried, "matched" the number
-    of pairs with verified matches, and "matches" the largest number of verified matches of a pair.
+    Keys: "features" is the median number in a photograph, "pairs" the number of pairs that were tried, "matched" the
+    number of pairs with verified matches, and "matches" the largest number of verified matches of a pair.
     """
     with contextlib.closing(sqlite3.connect(database)) as connection:
         features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
