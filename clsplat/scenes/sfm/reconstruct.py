@@ -119,7 +119,7 @@ def reconstruct(
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
 
     images: a folder with photographs, videos or both, or a video. Frames of videos are written to a folder, and used
-        like photographs. A folder of frames that `take_frames` wrote is used like their videos.
+        like photographs. A folder of frames from `take_frames` is used like its videos.
 
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points, frame.json) and
     sfm.json. It is created when all files are complete. A result for the same photographs and settings is reused.
