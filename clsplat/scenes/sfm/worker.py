@@ -34,7 +34,8 @@ reproducible.
 
 Mapping on several threads adds in varying order. Matching on several threads multiplies matrices in each of them. The
 OpenBLAS of pycolmap 4.2 is built without locks, so two threads may use the same scratch memory. Then some features are
-matched wrongly, once in about 70 reconstructions on a busy machine. Verification of matches has a thread of its own.
+matched wrongly, once in about 70 reconstructions on a busy machine. Beside one thread that
+matches, another one verifies the matches.
 """
 GLOBAL_FOLDER = "sparse-global"
 """Folder in the worker's folder for the models of the global mapper."""
@@ -69,7 +70,10 @@ class Worker:
         print(json.dumps(message), file=self.channel, flush=True)
 
     def begin(self, stage: str, total: int | None) -> None:
-        """Begin a stage, and end the stage before. total: number of its photographs or pairs, None if unknown."""
+        """End the stage before, begin a stage, and tell the parent.
+
+        total: number of photographs or pairs in the new stage; None if unknown.
+        """
         self.end()
         self._stage, self._began = stage, _clocks()
         self.say(stage=stage, total=total)
