@@ -43,7 +43,10 @@ def build(root: Path, output: Path) -> list[Path]:
 
 
 def content_problems(root: Path, sdist: Path, wheel: Path) -> list[str]:
-    """Return messages about files that differ: built ones from git's, or the wheel from one built from the sdist."""
+    """Return messages about files that an sdist or wheel lacks or has in excess of git's.
+
+    A further message says if a wheel that is built from the sdist has other bytes than `wheel`.
+    """
     files = set(bundled(root))
     in_wheel = {
         name if name.startswith("clsplat/") else f"clsplat/{name}"
