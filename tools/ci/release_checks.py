@@ -77,7 +77,7 @@ def findings(root: Path) -> list[Finding]:
 
 
 def version_problem(root: Path) -> str:
-    """Check that the version has a form in VERSION, and is the same in every file. Returns the problem or ""."""
+    """Check that the version matches VERSION, and is the same in every file. Returns the problem or ""."""
     version = project(root)["version"]
     if not VERSION.fullmatch(version):
         return f"pyproject.toml: version {version!r}, expected three numbers such as 0.1.0, or 0.1.0rc1"
