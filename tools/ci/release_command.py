@@ -58,7 +58,7 @@ def _check() -> int:
 def _build(output: Path, pythons: list[str]) -> int:
     """Build the sdist and the wheel, check them, and run the demo from each.
 
-    Writes the recipe for conda-forge into the same folder. pythons: the interpreters that run the demo.
+    output: folder for these files and for the recipe of conda-forge. pythons: the interpreters that run the demo.
     """
     sdist, wheel = build(ROOT, output)
     check_contents(ROOT, sdist, wheel)
