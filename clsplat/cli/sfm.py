@@ -74,7 +74,7 @@ def run(verb: SfmVerb, services: Services) -> int:
     if verb.frames is not None and verb.frames < 1:
         raise InputError(f"--frames {verb.frames}: expected at least 1")
     if not verb.photos.exists():
-        raise InputError(f"{verb.photos}: no such folder or video, expected one with photos")
+        raise InputError(f"{verb.photos}: no such file or folder, expected a folder with photos, or a video")
     if verb.threads is not None and verb.threads < 1:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
     if verb.invert_masks and not verb.masks:

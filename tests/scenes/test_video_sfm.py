@@ -187,7 +187,7 @@ def test_layout_of_a_video_and_of_a_folder_of_videos(video: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda path: None, "no such folder or video, expected one with photos"),
+        (lambda path: None, "no such file or folder, expected a folder with photos, or a video"),
         (lambda path: path.write_text("hello" * 50), "cannot be read as a video"),
     ],
 )

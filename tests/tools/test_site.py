@@ -194,7 +194,7 @@ def test_calls_that_are_wrong(tmp_path: Path) -> None:
     folder = repository(tmp_path / "a")
     done = versions(folder, folder)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"tools/ci/site_versions.py: {folder} has files of something else; give a new folder\n"
+    assert done.stderr == f"tools/ci/site_versions.py: {folder} has files but no versions.json; give a new folder\n"
     assert versions(folder, "a", "b").returncode == 2
     assert "--versions" not in versions(folder, "--help").stdout
 

@@ -34,7 +34,7 @@ CHECKSUM = re.compile(r'^( *sha256: )"[0-9a-f]{64}"', re.MULTILINE)
 
 
 def rendered(path: Path, system: str) -> dict[str, Any]:
-    """The recipe as conda's reader understands it for a system. It raises an error where the file is not valid."""
+    """The recipe as conda's reader understands it for a system. The reader raises an error if the file is not valid."""
     from rattler_build import PlatformConfig, RenderConfig, Stage0Recipe
 
     platform = PlatformConfig(target_platform=system, build_platform=system, host_platform=system)

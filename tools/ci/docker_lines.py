@@ -6,7 +6,7 @@
 
 Each file starts from its own copy of the Debian that its line FROM names. RUN, COPY, ENV and WORKDIR do what they do in
 Docker, then the command of ENTRYPOINT and CMD runs once. The wheel has to be in dist/ (`tools/release --build`).
-Roots and copies lie in the folder --roots, and the roots serve the next run too.
+Roots and copies are in the folder --roots. The next run uses the same roots, and new copies.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ exec chroot "$0" /bin/sh -c "$1\""""
 
 @dataclass(frozen=True)
 class Line:
-    """An instruction of a Docker file, with its continuation lines joined. number: of its first line, from 1."""
+    """An instruction of a Docker file, with its continuation lines joined. number: that of its first line, from 1."""
 
     number: int
     keyword: str
@@ -76,7 +76,10 @@ def lines_of(text: str) -> Iterator[Line]:
 
 
 def base_of(path: Path) -> str:
-    """The Debian release of the line FROM. Raises ValueError at a line of a kind that this tool does not run."""
+    """Return the Debian release that the line FROM names.
+
+    Raises ValueError for an instruction that this tool does not run, and if the first line is not FROM with Debian.
+    """
     lines = list(lines_of(path.read_text("utf-8")))
     for line in lines:
         if line.keyword not in KNOWN:
@@ -103,7 +106,10 @@ def fresh_root(roots: Path, release: str) -> Path:
 
 
 def run_file(path: Path, roots: Path, context: Path) -> None:
-    """Run all lines of a Docker file in a copy of its base. Exits with a message at the first that fails."""
+    """Run all lines of a Docker file in a copy of its base, then the image's command.
+
+    Exits with a message at the first line that fails. context: folder that COPY reads from.
+    """
     base = fresh_root(roots, base_of(path))
     image = Image(roots / path.stem)
     shutil.rmtree(image.folder, ignore_errors=True)
@@ -155,7 +161,10 @@ def _step(image: Image, line: Line, context: Path) -> bool:
 
 
 def _run(image: Image, command: str) -> bool:
-    """Run a shell command in the image. pip's variables of this machine apply, so that it finds the same index."""
+    """Run a shell command in the image. Returns False if it failed.
+
+    This machine's variables for pip are passed, so that pip uses the same package index in the image.
+    """
     pip = {name: value for name, value in os.environ.items() if name.startswith("PIP_") and name != "PIP_FIND_LINKS"}
     if "PIP_CERT" in pip:
         pip["PIP_CERT"] = f"/{CERTIFICATES}"

@@ -56,13 +56,13 @@ def resolved(system: str, python: str, extras: list[str]) -> tuple[list[str], st
 
 
 def pip_finds(system: str, python: str, pinned: list[str]) -> str:
-    """Empty if pip finds a wheel of each requirement; otherwise pip's reason."""
+    """Return "" if pip finds a wheel of each pinned requirement; otherwise pip's reason."""
     tags = [word for tag in SYSTEM_TAGS[system][1] for word in ("--platform", tag)]
     with tempfile.TemporaryDirectory() as folder:
         listed = Path(folder) / "pinned.txt"
         listed.write_text("\n".join(pinned) + "\n", "utf-8")
         command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--no-deps", "--ignore-installed"]
-        command += ["--ignore-requires-python"]  # pip asks it of the running Python; uv has asked it of the other
+        command += ["--ignore-requires-python"]  # pip would check the running Python; uv checked `python`
         command += ["--target", folder, "--only-binary", ":all:", "--python-version", python, *tags, "-r", str(listed)]
         result = subprocess.run(command, env=_variables(), capture_output=True, text=True, check=False)
     errors = [line for line in result.stderr.splitlines() if line.startswith("ERROR: ")]
@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _variables() -> dict[str, str]:
-    """The environment, with pip's certificates and indexes for uv too."""
+    """Return the environment variables, with pip's certificates and index also under uv's names."""
     variables = dict(os.environ)
     for pip, uv in (("PIP_CERT", "SSL_CERT_FILE"), ("PIP_INDEX_URL", "UV_DEFAULT_INDEX")):
         if pip in variables:

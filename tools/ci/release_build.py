@@ -43,7 +43,10 @@ def build(root: Path, output: Path) -> list[Path]:
 
 
 def content_problems(root: Path, sdist: Path, wheel: Path) -> list[str]:
-    """Differences of the built files from git's, and of the wheel from the one that is built from the sdist."""
+    """Return messages about files that an sdist or wheel lacks or has in excess of git's.
+
+    A further message says if a wheel that is built from the sdist has other bytes than `wheel`.
+    """
     files = set(bundled(root))
     in_wheel = {
         name if name.startswith("clsplat/") else f"clsplat/{name}"
@@ -64,7 +67,10 @@ def content_problems(root: Path, sdist: Path, wheel: Path) -> list[str]:
 
 
 def differences(title: str, found: set[str], expected: set[str]) -> list[str]:
-    """Messages about files that are missing, and about files that git does not have."""
+    """Return messages about files that a built file lacks, and about files in it that git does not have.
+
+    title: "sdist" or "wheel".
+    """
     missing, more = sorted(expected - found), sorted(found - expected)
     return [
         *([f"{title}: without {named(missing)}, which git has"] if missing else []),
@@ -105,10 +111,11 @@ def check_contents(root: Path, sdist: Path, wheel: Path) -> None:
 
 
 def try_out(package: Path, python: str) -> str:
-    """Install a file into an empty environment of an interpreter, list devices, and train the demo there. Returns a
-    line with the version of Python and the seconds. Exits if a command fails.
+    """Install a built file into a new virtual environment, list devices, and run the demo there.
 
-    python: path or name of the interpreter.
+    Returns a line with the version of Python and the seconds. Exits if a command fails.
+
+    package: the sdist or the wheel. python: path or name of the interpreter.
     """
     begun = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
@@ -128,7 +135,7 @@ def try_out(package: Path, python: str) -> str:
 
 
 def interpreters(asked: list[str]) -> list[str]:
-    """The interpreters that are asked for, or this one. Raises ValueError if there is no such program."""
+    """Return the interpreters asked for; if none, the running one. Raises ValueError if a program is missing."""
     for name in asked:
         if shutil.which(name) is None:
             raise ValueError(f"--python {name}: no such program, expected a Python such as python3.12")

@@ -43,7 +43,7 @@ INSTALLS = {
         ", `'.[": ", `'clsplat[",
     },
 }
-"""Lines about installing, by file: as they are before the first upload, and as they are from then on."""
+"""Lines about installing, by file: before the first upload to the package index, and the lines that replace them."""
 MOST_NAMED = 5
 """Number of files that a message names before it counts the others."""
 
@@ -63,7 +63,7 @@ def project(root: Path) -> dict[str, Any]:
 
 
 def findings(root: Path) -> list[Finding]:
-    """All checks of the commit at hand, in the order of a release."""
+    """Check the checkout's commit, in the order of a release. Returns a finding for each check."""
     version = project(root)["version"]
     checks: list[tuple[str, Callable[[], str]]] = [
         (f"version {version}", lambda: version_problem(root)),
@@ -77,7 +77,7 @@ def findings(root: Path) -> list[Finding]:
 
 
 def version_problem(root: Path) -> str:
-    """The version is one that is released, and the same in every file."""
+    """Check that the version matches VERSION, and is the same in every file. Returns the problem or ""."""
     version = project(root)["version"]
     if not VERSION.fullmatch(version):
         return f"pyproject.toml: version {version!r}, expected three numbers such as 0.1.0, or 0.1.0rc1"
@@ -90,7 +90,10 @@ def version_problem(root: Path) -> str:
 
 
 def changelog_problem(root: Path, version: str) -> str:
-    """The changelog has a dated section of the version, after an empty one of what is not released."""
+    """Check that an empty section [Unreleased] and a dated section of the version open the changelog.
+
+    Returns the problem or "".
+    """
     text = (root / "CHANGELOG.md").read_text("utf-8")
     sections = re.split(r"^## \[(.+?)\](.*)$", text, flags=re.MULTILINE)[1:]
     names = sections[::3]
@@ -109,7 +112,7 @@ def changelog_problem(root: Path, version: str) -> str:
 
 
 def install_problem(root: Path) -> str:
-    """README and the page on installing name the package index instead of the checkout."""
+    """Check that README and docs/install.md install from the package index. Returns the problem or ""."""
     for name, lines in INSTALLS.items():
         text = (root / name).read_text("utf-8")
         for before, after in lines.items():
@@ -119,13 +122,13 @@ def install_problem(root: Path) -> str:
 
 
 def tree_problem(root: Path) -> str:
-    """Nothing is changed, and nothing unknown to git lies in the tree."""
+    """Check that no file is changed, and that git knows or ignores every file. Returns the problem or ""."""
     changed = _git(root, "status", "--porcelain").splitlines()
     return f"{named(line[3:] for line in changed)}: not committed; commit or remove what differs" if changed else ""
 
 
 def tag_problem(root: Path, version: str) -> str:
-    """The commit has the version's tag and no other version's."""
+    """Check that the commit has the tag of the version, and of no other version. Returns the problem or ""."""
     tags = _git(root, "tag", "--points-at", "HEAD", "--list", "v*").split()
     if not tags:
         return (
@@ -136,7 +139,10 @@ def tag_problem(root: Path, version: str) -> str:
 
 
 def licence_problem(root: Path) -> str:
-    """Every bundled file has a free licence, by its own line or by REUSE.toml, with its text in the checkout."""
+    """Check that every bundled file has a licence in FREE, stated in the file or in REUSE.toml.
+
+    The text of the licence has to be in the checkout. Returns the problem or "".
+    """
     stated = {name: licence_of(root, name) for name in bundled(root)}
     without = [name for name, licence in stated.items() if licence is None]
     if without:
@@ -161,7 +167,7 @@ def licence_of(root: Path, name: str) -> str | None:
 
 
 def bundled(root: Path) -> list[str]:
-    """Files of the sdist, sorted, as git lists them: also all of the wheel, which is a part of them."""
+    """Return the files in git that the sdist has to contain, sorted. They include all files of the wheel."""
     document = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))
     only = document["tool"]["hatch"]["build"]["targets"]["sdist"]["only-include"]
     listed = _git(root, "ls-files", "-z", "--", *only, "pyproject.toml", ".gitignore")  # hatchling adds these two
@@ -176,10 +182,11 @@ def named(names: Iterable[str]) -> str:
 
 
 def prepare(root: Path, date: str) -> list[str]:
-    """Write what the tagged commit needs: the changelog's section and the lines about installing. Returns the names of
-    the changed files.
+    """Write what the tagged commit needs. Returns the names of the changed files.
 
-    date: of the release, as 2026-11-30.
+    This is the changelog's section of the version, the date in CITATION.cff, and the lines about installing.
+
+    date: date of the release, such as 2026-11-30.
     """
     version = project(root)["version"]
     texts = {name: (root / name).read_text("utf-8") for name in ("CHANGELOG.md", "CITATION.cff", *INSTALLS)}
@@ -200,8 +207,10 @@ def prepare(root: Path, date: str) -> list[str]:
 
 @functools.cache
 def _annotations(path: Path) -> list[tuple[re.Pattern[str], str]]:
-    """The rows of REUSE.toml, the last of which applies: a pattern of names, and a licence. `*` of a glob stays in a
-    folder, `**` does not."""
+    """Return the rows of REUSE.toml: a pattern of file names, and a licence. Of matching rows, the last applies.
+
+    In a glob `*` matches names in one folder, and `**` also names in sub-folders.
+    """
     wild = {"**": ".*", "*": "[^/]*"}
     return [
         (re.compile("".join(wild.get(part, re.escape(part)) for part in re.split(r"(\*\*|\*)", glob))), licence)

@@ -23,7 +23,7 @@ def main(arguments: list[str]) -> int:
         "--check", action="store_true", help="whether this commit can be released: version, changelog, licences, tag"
     )
     what.add_argument(
-        "--prepare", action="store_true", help="date the changelog's section, and let README install from the index"
+        "--prepare", action="store_true", help="date the changelog and CITATION.cff, let README install from the index"
     )
     what.add_argument(
         "--build", action="store_true", help="build sdist and wheel, check both, and run the demo from each"
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _check() -> int:
-    """Print a line for each check."""
+    """Print a line for each check. Returns 1 if one failed."""
     every = findings(ROOT)
     for each in every:
         print(f"{'FAILED' if each.problem else 'ok':8}{each.title}{': ' if each.problem else ''}{each.problem}")
@@ -56,7 +56,10 @@ def _check() -> int:
 
 
 def _build(output: Path, pythons: list[str]) -> int:
-    """Build, check and try both files, and write the recipe for conda-forge beside them."""
+    """Build the sdist and the wheel, check them, and run the demo from each.
+
+    output: folder for these files and for the recipe of conda-forge. pythons: the interpreters that run the demo.
+    """
     sdist, wheel = build(ROOT, output)
     check_contents(ROOT, sdist, wheel)
     write_recipe(sdist, output / "recipe.yaml")

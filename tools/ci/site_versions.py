@@ -52,9 +52,12 @@ def built(sources: Path, target: Path) -> bool:
 
 
 def add(site: Path, version: str, *aliases: str) -> None:
-    """Add the site in a folder to the branch of the repository in the working folder."""
+    """Add the site in a folder to the branch BRANCH of the repository in the working folder.
+
+    version: name of its folder in the branch. aliases: further names that lead to it, such as latest.
+    """
     settings = {"site_dir": str(site), "use_directory_urls": False}
-    redirect = commands.AliasType.redirect  # a link in the file system would not get through a workflow's artefact
+    redirect = commands.AliasType.redirect  # a symbolic link would be lost in a workflow's artefact
     with commands.deploy(
         settings, version, None, list(aliases), alias_type=redirect, branch=BRANCH, message=version, allow_empty=True
     ):
@@ -62,10 +65,10 @@ def add(site: Path, version: str, *aliases: str) -> None:
 
 
 def build_all(scratch: Path) -> bool:
-    """Build every version into the branch of the repository in the working folder.
+    """Build every version into the branch of the repository in the working folder. Returns True when all is built.
 
-    scratch: a folder for sources and sites. Returns False, before any release is built, if the checkout's site has
-    warnings.
+    If the checkout's site has warnings, returns False before any release is built. scratch: folder for sources and
+    sites.
     """
     if not built(ROOT, scratch / "site" / CHECKOUT):
         return False
@@ -91,9 +94,9 @@ def main() -> int:
         return 0 if len(sys.argv) == 2 else 2
     target = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build/versions").resolve()
     if target.is_dir() and any(target.iterdir()) and not (target / "versions.json").is_file():
-        print(f"tools/ci/site_versions.py: {target} has files of something else; give a new folder", file=sys.stderr)
+        print(f"tools/ci/site_versions.py: {target} has files but no versions.json; give a new folder", file=sys.stderr)
         return 2
-    os.environ.update(GIT_COMMITTER_NAME="clsplat", GIT_COMMITTER_EMAIL="clsplat@example.org")  # mike needs a name
+    os.environ.update(GIT_COMMITTER_NAME="clsplat", GIT_COMMITTER_EMAIL="clsplat@example.org")  # for mike's commits
     with tempfile.TemporaryDirectory() as folder:
         repository = Path(folder, "repository")
         git(Path(folder), "init", "-q", "--bare", repository.name)
@@ -103,7 +106,7 @@ def main() -> int:
             shutil.rmtree(target, ignore_errors=True)
             target.mkdir(parents=True)
             git(repository, f"--work-tree={target}", "checkout", "-q", BRANCH, "--", ".")
-        os.chdir(ROOT)  # Windows does not remove a working folder
+        os.chdir(ROOT)  # Windows cannot remove the working folder of a process
     if complete:
         print(target / "index.html")
     return 0 if complete else 1

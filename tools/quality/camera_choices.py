@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiment of `clsplat sfm`: the seconds of each stage, and what the cameras are worth, by choice."""
+"""Experiment with choices of `clsplat sfm`: seconds of each stage, reprojection error, and PSNR of trained models."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def settings_of(choice: str, seed: int) -> SfmSettings:
     for entry in filter(None, choice.replace("auto", "").split(",")):
         name, _, value = entry.partition("=")
         if name not in ("matching", "mapper", "features", "weights", "camera_model"):
-            raise InputError(f"--choices {choice}: {name!r} is no setting, expected such as matching=exhaustive")
+            raise InputError(f"--choices {choice}: {name!r} is no setting, expected one such as matching=exhaustive")
         changes[name] = value
     settings = SfmSettings(seed=seed, **changes)
     settings.check()
@@ -38,7 +38,7 @@ def settings_of(choice: str, seed: int) -> SfmSettings:
 def cameras(given: Namespace) -> Rows:
     """Seconds of each stage of `clsplat sfm` (processor time / wall time), photographs placed, reprojection error.
 
-    Each photograph's folder is reconstructed with every choice. Scenes that exist in FOLDER are not made again. With
+    Each folder of photographs is reconstructed with every choice. Scenes that exist in FOLDER are not made again. With
     --psnr each is trained too, and its held-out PSNR is in the last column.
     """
     scored = ("PSNR, dB",) if given.psnr else ()

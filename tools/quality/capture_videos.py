@@ -37,7 +37,10 @@ KINDS: dict[str, dict[str, Any]] = {"plain": {}, "hlg": {"hlg": True}, "turned":
 
 
 def captured(source: Path, output: Path, *more: str) -> dict[str, Any]:
-    """Capture a video or a folder. Returns eval.json. Raises SystemExit if the capture fails."""
+    """Capture a video or a folder. Returns the contents of eval.json. Raises SystemExit if the capture fails.
+
+    more: further arguments of `clsplat capture`.
+    """
     if status := clsplat(["capture", str(source), "-o", str(output), *more]):
         raise SystemExit(status)
     result: dict[str, Any] = json.loads((output / "run" / "eval.json").read_text("utf-8"))
@@ -50,7 +53,10 @@ def processor_seconds() -> float:
 
 
 def write_stills(capture: Path, made: Walk, folder: Path) -> int:
-    """Render a sharp photograph for each frame that a capture has taken from its video. Returns their number."""
+    """Render a sharp photograph for each frame that a capture has taken from its video. Returns their number.
+
+    capture: folder of the capture. made: the walk that the video shows. folder: folder for the photographs.
+    """
     folder.mkdir(exist_ok=True)
     (video,) = json.loads((capture / "frames" / FRAME_TABLE_FILE).read_text("utf-8"))["videos"]
     surfaces = ray_caster.still_life()
@@ -65,10 +71,10 @@ def main() -> int:
     """Capture the videos and their stills, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--kinds", default="plain", help="of plain, hlg, turned; several with commas")
-    parser.add_argument("--size", default="480x270", help="of the video in pixels")
-    parser.add_argument("--length", type=int, default=200, help="of the video in frames, ten a second")
-    parser.add_argument("--frames", default="48", help="to take from each video")
+    parser.add_argument("--kinds", default="plain", help="kinds of videos: plain, hlg, turned; several with commas")
+    parser.add_argument("--size", default="480x270", help="size of the video in pixels")
+    parser.add_argument("--length", type=int, default=200, help="length of the video in frames, ten a second")
+    parser.add_argument("--frames", default="48", help="number of frames to take from each video")
     parser.add_argument("--iterations", default="2000")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How level scenes are after `--orient up`: a floor that was not used for it, and walls.
+"""Measures how level scenes are after `--orient up`, by the cameras, the floor and walls.
 
     python tools/quality/level.py SCENE...
 
@@ -33,7 +33,7 @@ WALL_HEADINGS = 36
 
 
 def row(scene: Path) -> tuple[str, str, str, str, str]:
-    """Return the cells of a scene."""
+    """Return the cells of a scene's row: name, angles of cameras, floor and wall, and what decided up."""
     model = find_model(scene)
     if model is None:
         raise SystemExit(f"{scene}: has no COLMAP model, expected a scene with sparse/0")
@@ -56,7 +56,10 @@ def row(scene: Path) -> tuple[str, str, str, str, str]:
 
 
 def wall(points: Float64, radius: float) -> str:
-    """Return the angle of the largest wall from the vertical."""
+    """Return the angle of the largest wall from the vertical in degrees, as text; "-" if there is no wall.
+
+    radius: radius of the scene, as for `level_plane`.
+    """
     best, found = 0.0, "-"
     for heading in np.pi * np.arange(WALL_HEADINGS) / WALL_HEADINGS:
         ahead = np.array([np.cos(heading), 0.0, np.sin(heading)])

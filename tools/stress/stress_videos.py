@@ -4,11 +4,11 @@
     tools/stress/run videos [--width 960] [--height 540] [--frames 120] [--choose 40] [--keep FOLDER]
 
 The walk is of the demo's still life (`tests/support/walk_videos.py`), 10 frames a second. Codings are H.264 of 8 bits,
-the same stored turned by 90 degrees, and HEVC of 10 bits in HLG. Columns: frames chosen; chosen frames in the turn;
-chosen frames that are not sharper than the median of their stretch; by how much the others are sharper, at the least
-and in the mean; mean error of the written frames against the rendered ones in levels of 255; wall seconds and processor
-seconds of `take_frames`. The exit status is 1 if a frame is of the turn, is not sharper, or has other bytes the second
-time.
+the same with frames stored turned by 90 degrees, and HEVC of 10 bits in HLG. Columns: frames chosen; chosen frames in
+the turn; chosen frames that are not sharper than the median of their stretch; by how much chosen frames are sharper
+than that median, minimum and mean; mean error of the written frames against the rendered ones in levels of 255; wall
+seconds and processor seconds of `take_frames`. The exit status is 1 if a chosen frame is in the turn or not sharper, or
+if the same frames taken again have other bytes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ VARIANTS: dict[str, dict[str, Any]] = {"H.264": {}, "H.264, turned": {"turns": 1
 
 
 def row(name: str, made: Walk, video: Path, folder: Path, count: int) -> tuple[list[str], bool]:
-    """A row of the table, and True if the frames are as they should be."""
+    """Return a row of the table, and False if the frames fail a condition on which the exit status depends.
+
+    made: the rendered walk. video: its file. folder: folder for frames. count: number of frames to choose.
+    """
     wall, processor = time.perf_counter(), time.process_time()
     taken = take_frames([video], folder / "a", count=count)
     spent = time.perf_counter() - wall, time.process_time() - processor
@@ -52,7 +55,7 @@ def row(name: str, made: Walk, video: Path, folder: Path, count: int) -> tuple[l
     values = [name, str(len(chosen)), str(turned), str(worse), f"{gains.min():.4f}", f"{gains.mean():.4f}"]
     values += [f"{error(made, taken):.2f}", f"{spent[0]:.1f}", f"{spent[1]:.1f}"]
     if not same:
-        print(f"{name}: the second time some files have other bytes", file=sys.stderr)
+        print(f"{name}: the same frames taken again have other names or bytes", file=sys.stderr)
     return values, same and not turned and not worse
 
 

@@ -60,8 +60,8 @@ the correlation of photographs with their undistorted copies is 0.9995. In six o
 it is at least 0.93. The correlation of successive photographs of these scenes is 0.16 to 0.87, and that of photographs
 farther apart is at most 0.45.
 
-Frames of an almost still video correlate more than pictures and their copies after strong undistortion. So two folders
-of such frames are mistaken for copies.
+Frames of an almost still video correlate more than pictures and their copies after strong undistortion. So two related
+folders with frames of such a video are mistaken for copies.
 """
 FOLDER_PAIR_SAMPLES = 5
 """Number of pairs of pictures that are decoded to compare two folders."""
@@ -387,8 +387,8 @@ def _found(
 def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
     """Find files with the same bytes. Returns the copies by name.
 
-    Of equal files, the file whose folder has the earliest stage in UNDISTORTION_FOLDERS is used. If several files share
-    this stage, the file with the shortest name is used.
+    Of equal files, the file whose folder has the earliest stage in UNDISTORTION_FOLDERS is used. A file
+    in no sub-folder is among the earliest. If several files share the stage, the file with the shortest name is used.
     """
     alike: dict[tuple[object, ...], list[str]] = {}
     keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)

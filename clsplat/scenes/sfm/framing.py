@@ -20,9 +20,10 @@ MODEL_FOLDER = Path("sparse", "0")
 
 
 def turn_new(scene: Path, photos: Path, use: FrameUse, where: object) -> None:
-    """Turn a new reconstruction upright, unless `use` wants COLMAP's axes. It keeps them if up cannot be found.
+    """Turn a new reconstruction upright, unless `use.orient` is "none". The scale is not set here.
 
-    Arguments as for `set_frame`; the scale is not set here. Warns if the axes are kept: no result must be lost.
+    If no up direction can be found, the reconstruction keeps COLMAP's axes, with a warning instead of an error, so that
+    the result is not lost. Arguments as for `set_frame`.
     """
     if use.orient == "none":
         return
@@ -39,7 +40,10 @@ def photograph_of(photos: Path, name: str) -> Path:
 
 
 def scale_new(scene: Path, photos: Path, use: FrameUse) -> None:
-    """Set the scale of a new reconstruction that is complete. Raises InputError, and then the result stays unscaled."""
+    """Set the scale of a new, complete reconstruction, if `use` has one.
+
+    Raises InputError if the scale cannot be found. The result then stays as it is, unscaled.
+    """
     if not use.scale:
         return
     axes: Orient | None = None if use.orient == "none" else "up"
@@ -50,7 +54,7 @@ def scale_new(scene: Path, photos: Path, use: FrameUse) -> None:
 
 
 def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneFrame:
-    """Change the frame of a reconstruction. Returns the new frame; all files stay if it is the present one.
+    """Change the frame of a reconstruction. Returns the new frame. If it equals the present frame, no file changes.
 
     The model's folder is replaced as a whole, so that cameras, points and frame.json always fit together.
 

@@ -71,7 +71,9 @@ def find_photos(
     """Return the photographs below a folder, sorted by name, and the files that are left out, keyed by the reason.
 
     Hidden files and folders are skipped, as are the folders `excluded` (outputs, if they are inside). Raises InputError
-    for a folder that does not exist or cannot be read, and for one without photographs if they are `needed`.
+    for a folder that does not exist or cannot be read, and for a photograph whose name has unprintable characters.
+
+    needed: True to raise InputError if there are no photographs.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a folder with photos")
@@ -248,7 +250,7 @@ def _write_upright(path: Path, copy: Path, spec: Any, pixels: NDArray[Any] | Non
     if not written:
         if error := room_error(copy.parent):
             raise write_error(copy, error)
-        raise ClsplatError(f"{copy}: cannot write the rotated copy of {path}: {_last_line(upright.geterror())}")
+        raise ClsplatError(f"{copy}: cannot write the upright copy of {path}: {_last_line(upright.geterror())}")
 
 
 def _last_line(text: str) -> str:

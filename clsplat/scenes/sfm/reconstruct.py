@@ -53,15 +53,15 @@ class SfmSettings:
 
     matching: the pairs of photographs that are matched. "exhaustive": all. "sequential": neighbours in each video, and
         outside videos in the order of names. "spatial": the nearest by EXIF's GPS. "retrieval": the most similar by
-        their features. "auto": all of up to 40 photographs, else neighbours and similar photographs of videos, near
-        photographs with GPS positions that differ enough, and similar photographs otherwise.
+        their features. "auto": all pairs of up to 40 photographs. Of more: neighbours and the most similar if there
+        are videos, the nearest if most have GPS positions and these differ enough, otherwise the most similar.
     camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
     mapper: "incremental" adds one photograph after another. "global" solves for all cameras at once. "auto" is
-        "incremental", and "global" where that places less than 60 % of the photographs.
+        "incremental", and also "global" if "incremental" places less than 60 % of the photographs.
     features: "sift", or "aliked", learned features.
     weights: for "aliked" the file of the network, or a name in `weights.WEIGHTS_BY_NAME`; None for the default name.
     seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.
@@ -123,7 +123,7 @@ def reconstruct(
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
 
     images: a folder with photographs, videos or both, or a video. Frames of videos are written to a folder, and used
-        like photographs. A folder that `take_frames` wrote counts as the videos.
+        like photographs. A folder of frames from `take_frames` is used like its videos.
 
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points, frame.json) and
     sfm.json. It is created when all files are complete. A result for the same photographs and settings is reused.
@@ -173,14 +173,14 @@ def reconstruct(
 def _files(
     images: Path, output: Path, videos: VideoFrames
 ) -> tuple[list[Path], dict[str, sfm_copies.Copy], dict[str, list[Path]]]:
-    """Return the photographs, the copies by name that are not among them, and the files left out by the reason."""
+    """Return the photographs without copies, the copies by name, and the files that are left out, by the reason."""
     paths, left_out = videos.photos_beside(images, output)
     copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
     return [path for path in paths if sfm_photos.photo_name(images, path) not in copies], copies, left_out
 
 
 def _warn_of_left_out(images: Path, left_out: dict[str, list[Path]]) -> None:
-    """Warn of photographs and videos that are left out. left_out: their files by the reason."""
+    """Warn of photographs and videos that are left out. left_out: lists of files, keyed by the reason."""
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
         kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
@@ -311,7 +311,7 @@ def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo]
 def _warn_of_losses(
     images: Path, photos: list[sfm_photos.Photo], answer: dict[str, Any], result: Path, masks: MaskUse | None
 ) -> None:
-    """Warn of photographs without a pose, and of transparent photographs that lost their alpha.
+    """Warn of focal lengths unlike EXIF's, photographs without a pose or in a smaller model, and lost alpha.
 
     answer: the worker's result, with the names of the photographs with a pose, and of those in smaller models.
     result: folder of the undistorted photographs.
@@ -392,7 +392,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
     files = record.get("files")
-    was = files if isinstance(files, dict) else {}  # sfm.json may lack the list of files
+    was = files if isinstance(files, dict) else {}  # records of earlier versions have no list of files
     now = _sizes(output)
     changed = sorted(name for name, size in was.items() if now.get(name) != size)
     if complete and not changed and record.get("fingerprint") == fingerprint:

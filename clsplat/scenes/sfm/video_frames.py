@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos among the photographs of structure from motion: their frames become photographs, each video its own camera."""
+"""Videos among the photographs of structure from motion: their frames become photographs. Each video is one camera."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, take_
 from clsplat.scenes.video.reading import VIDEO_INPUT_SUFFIXES, is_video_name
 
 RECONSTRUCTION_SUFFIX, FRAMES_SUFFIX = "_colmap", "_frames"
-"""Ends of the names of two folders beside photographs or a video: their cameras, and a video's frames."""
+"""Suffixes of the names of two folders beside photographs or a video: for the cameras, and for the frames of videos."""
 
 
 def reconstruction_folder(images: Path) -> Path:
@@ -48,8 +48,8 @@ class VideoFrames:
 
     folder: folder of the frames.
     paths: the frames' files, sorted by name.
-    sequences: names of the frames of each video, in display order. They may also be of a folder of frames that was
-        given in place of photographs.
+    sequences: names of the frames of each video, in display order. If a folder of frames was given in place of
+        photographs, they are the names of its frames.
     left_out: videos that are not used, keyed by the reason.
     """
 
@@ -74,15 +74,15 @@ class VideoFrames:
         return photos, {**left_out, **self.left_out}
 
     def staged(self, target: Path, report: Callable[[float], None], threads: int) -> list[Photo]:
-        """Put the frames under `target`, as `stage_photos` does. Frames of one video share a camera with no others."""
+        """Put the frames under `target`, as `stage_photos` does. Frames of one video share its camera."""
         if not self.paths:
             return []
         return self.by_video(stage_photos(self.folder, self.paths, target, report, threads))
 
     def by_video(self, photos: list[Photo]) -> list[Photo]:
-        """Return photographs with the number of their video in the lens, by which frames of one video share a camera.
+        """Add the number of its video to the `lens` of each frame, so that only frames of one video share a camera.
 
-        Photographs that are not frames of `sequences` stay as they are.
+        Returns all photographs. Those that are not frames in `sequences` stay as they are.
         """
         video_of = {name: str(number) for number, names in enumerate(self.sequences) for name in names}
         return [
@@ -105,7 +105,7 @@ def frames_of_videos(
     output: folder for the cameras. count, overwrite: as for `take_frames`.
     folder: folder for the frames; by default `frames_folder(output)`.
     Without PyAV, videos beside photographs are left out, unless frames are asked for by `count`.
-    Raises InputError for a file that is not a video, and if `take_frames` does.
+    Raises InputError for a file that is not a video, for a `count` without videos, and if `take_frames` does.
     """
     folder = folder or frames_folder(output)
     videos = [images]
@@ -114,7 +114,7 @@ def frames_of_videos(
         videos, parts = find_videos(images, (output, folder))
     elif not is_video_name(images):
         if not images.exists():
-            raise InputError(f"{images}: no such folder or video, expected one with photos")
+            raise InputError(f"{images}: no such file or folder, expected a folder with photos, or a video")
         raise InputError(
             f"{images}: is a file, expected a folder with photos, or a video ({' '.join(VIDEO_INPUT_SUFFIXES)})"
         )

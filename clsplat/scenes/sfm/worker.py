@@ -34,7 +34,8 @@ reproducible.
 
 Mapping on several threads adds in varying order. Matching on several threads multiplies matrices in each of them. The
 OpenBLAS of pycolmap 4.2 is built without locks, so two threads may use the same scratch memory. Then some features are
-matched wrongly, once in about 70 reconstructions on a busy machine. Verification of matches has a thread of its own.
+matched wrongly, once in about 70 reconstructions on a busy machine. Beside one thread that
+matches, another one verifies the matches.
 """
 GLOBAL_FOLDER = "sparse-global"
 """Folder in the worker's folder for the models of the global mapper."""
@@ -69,13 +70,16 @@ class Worker:
         print(json.dumps(message), file=self.channel, flush=True)
 
     def begin(self, stage: str, total: int | None) -> None:
-        """Begin a stage: tell the parent, and note the wall time and processor time of the stage before."""
+        """End the stage before, begin a stage, and tell the parent.
+
+        total: number of photographs or pairs in the new stage; None if unknown.
+        """
         self.end()
         self._stage, self._began = stage, _clocks()
         self.say(stage=stage, total=total)
 
     def end(self) -> None:
-        """Note the seconds of the stage that ends, in `seconds`."""
+        """Write the wall time and processor time of the ending stage to `seconds`."""
         if self._stage:
             wall, processor = (now - then for now, then in zip(_clocks(), self._began, strict=True))
             self.seconds[self._stage] = {"wall": round(wall, 2), "processor": round(processor, 2)}
@@ -146,9 +150,9 @@ class Worker:
     def map(self) -> mapping.Models:
         """Recover camera poses and points. Returns all models.
 
-        "auto" adds one photograph after another. If few are placed, as after a bad first pair, it solves for
-        all at once. If that places few, too, the cameras may be close together, or there may be few features, and
-        photographs are added with lower thresholds.
+        "auto" adds one photograph after another. If few are placed, as after a bad first pair, it solves for all at
+        once. If few are placed again, the cameras may be close together, or there may be few features. Then
+        photographs are added with lower thresholds. "incremental" does the same without solving for all at once.
         """
         choice = self.task["mapper"]
         models = {} if choice == "global" else self.add_one_by_one(relaxed=False)

@@ -42,6 +42,7 @@ _PROGRESS_BY_STAGE = {
 def run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
     """Run `clsplat.scenes.sfm.worker` to its end. Returns the worker's answer, {"result"}, {"failure"} or {"refused"}.
 
+    task: from `reconstruct.sfm_task`. work: folder for the worker's files and its log.
     Raises ClsplatError if the worker ends without an answer.
     """
     log_path = work / "log.txt"

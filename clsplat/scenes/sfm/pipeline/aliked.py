@@ -41,7 +41,7 @@ MIN_ALIKED_COSINE = 0.8
 
 
 class WeightsError(Exception):
-    """Error about a file that is not the network that is expected. Its text continues the file's name."""
+    """Error about a file that is not the expected network. Its text follows the file's name in the message."""
 
 
 class AlikedNetwork:
@@ -66,7 +66,10 @@ class AlikedNetwork:
             )
 
     def features(self, picture: NDArray[np.uint8], most: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the keypoints (K, 2) of a picture (H, W, 3) in COLMAP's pixels, and their unit descriptors (K, D)."""
+        """Return the keypoints (K, 2) of a picture (H, W, 3) in COLMAP's pixels, and their unit descriptors (K, D).
+
+        most: maximum number of features.
+        """
         height, width = picture.shape[:2]
         pads = [(0, -side % ALIKED_MULTIPLE_PX) for side in (height, width)]
         padded = np.pad(picture, [*pads, (0, 0)], mode="edge").astype(np.float32) / 255
@@ -130,8 +133,9 @@ def _features_of(name: str, task: dict[str, Any], network: AlikedNetwork) -> tup
 def match_aliked(
     database: Path, pairs: Sequence[Pair], *, threads: int, seed: int, done: Callable[[int], None]
 ) -> None:
-    """Match the features of pairs of photographs that are each other's nearest, and verify the matches.
+    """Match features that are each other's nearest, in pairs of photographs, and verify the matches.
 
+    pairs: numbers of photographs in the database. threads: number of threads of the verification.
     done: function that is called with the number of pairs that are matched.
     """
     with pycolmap.Database.open(database) as opened:

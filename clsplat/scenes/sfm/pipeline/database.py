@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""COLMAP's database of a reconstruction: numbers in the order of names, features, GPS positions, counts."""
+"""COLMAP's database of a reconstruction: images are numbered and renamed, features and GPS positions are read."""
 
 from __future__ import annotations
 
@@ -93,7 +93,9 @@ def largest_descriptors(database: Path, ids: Sequence[int], most: int) -> list[N
 
 
 def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
-    """Return the photographs' GPS positions (N, 2) in metres to the east and north of the first; NaN if unknown.
+    """Return the photographs' GPS positions (N, 2) in metres to the east and north of the first that is known.
+
+    Unknown positions are NaN.
 
     ids: numbers of the photographs.
     """
@@ -111,7 +113,11 @@ def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
 
 
 def feature_evidence(database: Path) -> dict[str, Any]:
-    """Return counts of features and matches, for the message about a failed reconstruction."""
+    """Return counts of features and matches, for the message about a failed reconstruction.
+
+    Keys: "features" is the median number in a photograph, "pairs" the number of pairs that were tried, "matched" the
+    number of pairs with verified matches, and "matches" the largest number of verified matches of a pair.
+    """
     with contextlib.closing(sqlite3.connect(database)) as connection:
         features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
         matches = [row[0] for row in connection.execute("SELECT rows FROM two_view_geometries")]

@@ -11,8 +11,8 @@ import pycolmap
 MIN_MODEL_PHOTOS = 3
 """Minimum number of photographs in a model."""
 GLOBAL_ADJUSTMENT_GROWTH = 1.3
-"""Growth of a model, in photographs or points, after which all its poses and points are adjusted again. pycolmap's
-default is 1.1."""
+"""Factor by which a model grows, in photographs or points, before all its poses and points are adjusted again.
+pycolmap's default is 1.1."""
 GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS = 2, 1
 """Maximum numbers of rounds of an adjustment of the whole model, and of the neighbours of a new photograph. Each round
 drops outliers. pycolmap's defaults are 5 and 2."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the pairs of photographs that are matched: all, neighbours in a sequence, near positions, alike pictures.
+"""Choice of the pairs of photographs to match: all, neighbours in a sequence, near positions, or similar pictures.
 
 A pair has two indices of photographs, the smaller first. Lists of pairs are sorted and name each pair once.
 """
@@ -23,7 +23,10 @@ SEQUENTIAL_OVERLAP = 12
 """Number of photographs before and after a photograph that sequential matching pairs with it. Sequential matching also
 pairs photographs that are 2^n apart."""
 LOOP_NEIGHBOURS = 10
-"""Number of the most similar photographs that are matched with each frame of a video, to close loops."""
+"""Number of the most similar photographs that are matched with each photograph, besides other pairs.
+
+They close the loops of a video's camera path, and join photographs without a GPS position to the others.
+"""
 ALIKE_NEIGHBOURS = 15
 """Number of the most similar photographs that retrieval matches with each photograph.
 
@@ -36,14 +39,14 @@ MIN_LOCATED_FRACTION = 0.9
 MIN_GPS_EXTENT_M = 25.0
 """Median distance in metres of the GPS positions from their median, from which "auto" trusts them.
 
-A phone's position is wrong by 5 to 10 m, so that positions around one object say little about near photographs.
+A phone's position is wrong by 5 to 10 m, so positions around one object hardly tell which photographs are near.
 """
 VISUAL_WORDS = 64
 """Number of cluster centres of the descriptors, the visual words of `image_similarity`."""
 RETRIEVAL_FEATURES = 1000
 """Number of features in a photograph, the largest first, that `image_similarity` uses."""
 CLUSTERED_EVERY, CLUSTERING_ROUNDS = 5, 10
-"""Clustering uses every fifth of the features that are used, and ends after this number of rounds."""
+"""`image_similarity` clusters every fifth of these features, in ten rounds of k-means."""
 
 
 def chosen_matching(matching: str, count: int, sequences: Sequence[Sequence[int]], positions: NDArray[Any]) -> str:
@@ -82,7 +85,7 @@ def sequential_pairs(order: Sequence[int]) -> list[Pair]:
 
 
 def nearest_pairs(distances: NDArray[Any], neighbours: int) -> list[Pair]:
-    """Return the pairs of each photograph with its nearest others.
+    """Return the pairs of each photograph with its nearest others, at most `neighbours` of them.
 
     distances: distance of every two photographs (N, N); infinite for pairs that are never matched. Among equal
         distances the photograph with the lower index is nearer.
@@ -109,7 +112,7 @@ def image_similarity(descriptors: Sequence[NDArray[Any]], seed: int) -> NDArray[
 
     Each photograph is described by a VLAD vector (Jegou, Douze, Schmid, Perez, 2010). It has the sums of the
     differences between descriptors and their nearest visual word, normalised by word and as a whole. The visual words
-    are the centres of a k-means clustering of the photographs' own descriptors, so that no file is needed.
+    are the centres of a k-means clustering of the photographs' own descriptors, so that no vocabulary file is needed.
 
     descriptors: for each photograph the descriptors (features, dimensions) of its largest features.
     seed: seed of the clustering. The same descriptors and seed give the same similarities.
