@@ -25,7 +25,7 @@ COLUMNS = {
 def settings_of(choice: str, seed: int) -> SfmSettings:
     """Return the settings of a choice such as "matching=exhaustive,mapper=global"; "auto" has the defaults."""
     changes: dict[str, Any] = {}
-    for entry in filter(None, choice.replace("auto", "").split(",")):
+    for entry in [] if choice == "auto" else choice.split(","):
         name, _, value = entry.partition("=")
         if name not in ("matching", "mapper", "features", "weights", "camera_model"):
             raise InputError(f"--choices {choice}: {name!r} is no setting, expected one such as matching=exhaustive")
