@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from calls import printed, python
-from quality import experiments, made_scenes
+from calls import printed, python, refuses
+from quality import camera_choices, experiments, made_scenes
 from quality.experiments import EXPERIMENTS
 from quality.run import main
 from quality.tables import AUTO
@@ -27,6 +28,7 @@ from clsplat.images.reading import read_image
 from clsplat.scenes.analysis.photo_findings import Finding
 from clsplat.scenes.analysis.recommendations import answered
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 LEVEL = 1 / 255
@@ -99,6 +101,7 @@ def test_an_experiment_makes_its_table(
     monkeypatch.setattr(experiments, "PHOTOS", 9)
     monkeypatch.setattr(experiments, "WIDTH", 32)
     monkeypatch.setattr(experiments, "LEAST", 2)
+    monkeypatch.setattr(camera_choices, "reconstruct", recorded)  # the tiny pictures have no features
     scenes = [str(write_binary(tmp_path / "scene"))] if EXPERIMENTS[name].scenes in (1, "+") or name == "poses" else []
     more = {
         "views": ["--views", "2,3"],
@@ -112,6 +115,22 @@ def test_an_experiment_makes_its_table(
     assert status == 0 or name == "units", table
     assert table.count("|---") >= 2
     assert printed(capsys, words, call=main, status=status).out == table, "runs that are there are not made again"
+
+
+def recorded(_images: Path, scene: Path, settings: SfmSettings, *, threads: int | None) -> None:
+    """Write the record of a reconstruction that placed eight of nine photographs."""
+    seconds = {stage: {"wall": 2.0, "processor": 3.0} for stage in ("features", "matches", "cameras", "undistorting")}
+    found = {"registered": ["a"] * 8, "photos": 9, "points": 7, "mean_reprojection_error": 0.5}
+    scene.mkdir(parents=True, exist_ok=True)
+    record = {**found, "matching": settings.matching, "pairs": 4 + (threads or 0), "seconds": seconds}
+    (scene / SFM_RECORD_FILE).write_text(json.dumps(record))
+
+
+def test_choices_of_cameras_are_settings() -> None:
+    asked = camera_choices.settings_of("mapper=auto,matching=exhaustive", 3)
+    assert asked == SfmSettings(mapper="auto", matching="exhaustive", seed=3)
+    assert camera_choices.settings_of("auto", 0) == SfmSettings()
+    refuses("'mappers' is no setting", camera_choices.settings_of, "mappers=global", 0)
 
 
 def write_binary(folder: Path) -> Path:
