@@ -304,7 +304,7 @@ def test_a_photo_of_another_kind_than_its_name_says_is_written_anew(
 
 
 def test_bad_folders(tmp_path, photos):
-    refuses(r"missing: no such folder", sfm.reconstruct, tmp_path / "missing", tmp_path / "out")
+    refuses(r"missing: no such file or folder", sfm.reconstruct, tmp_path / "missing", tmp_path / "out")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty/a.gif").write_bytes(b"")
     with pytest.raises(InputError, match=r"empty: no photos found, only 1 in unsupported formats such as a\.gif"):

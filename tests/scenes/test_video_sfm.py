@@ -74,7 +74,7 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
     shutil.rmtree(tmp_path / "scene_frames")
     sfm.reconstruct(video, tmp_path / "scene", frames=6)
     assert len(tasks) == 1
-    refuses("scene_frames: has the frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
+    refuses("scene_frames: has frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
     sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
     assert len(tasks) == 2
 
