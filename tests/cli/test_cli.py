@@ -152,7 +152,7 @@ def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
     assert captured.err.splitlines()[0] == "matching photos 50 %"
     options = {"threads": None, "overwrite": False, "masks": None, "frames": None}
     assert calls == [(folder, SfmSettings("sequential", "auto", mapper="global"), options)]
-    assert "none: no such folder" in rejected(capsys, ["sfm", tmp_path / "none", "-o", tmp_path / "out"])
+    assert "none: no such file or folder" in rejected(capsys, ["sfm", tmp_path / "none", "-o", tmp_path / "out"])
 
 
 def test_train(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
