@@ -121,7 +121,7 @@ class CaptureFolder:
 
 
 def _told(asked: Mapping[str, Any], keys: list[str]) -> str:
-    """Return the settings `keys` and their values as text, without those that are None or missing."""
+    """Return text with the settings named in `keys` and their values. Settings that are None or missing are omitted."""
     values = {key: asked[key] for key in keys if asked.get(key) is not None}
     texts = {key: examples(value) if isinstance(value, list) else value for key, value in values.items()}
     return ", ".join(f"{key} {text}" for key, text in texts.items()) or f"no {keys[0]}"

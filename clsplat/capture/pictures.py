@@ -6,10 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from clsplat.arrays import Float64
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
@@ -42,10 +39,9 @@ class ModelPictures:
         self._model = Gaussians.load(run.model_path)
         self.path = turntable(cameras, frames, up)
 
-    def _drawn(self, camera: Camera) -> NDArray[np.uint8]:
-        """Render the model on a black background, as 8-bit values (H, W, 3)."""
-        picture = self._renderer.render(self._model, camera, (0.0, 0.0, 0.0)).image
-        return np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+    def _drawn(self, camera: Camera) -> Float32:
+        """Render the model on a black background, (H, W, 3)."""
+        return self._renderer.render(self._model, camera, (0.0, 0.0, 0.0)).image
 
     def write_thumbnail(self, path: Path) -> None:
         """Write the first picture of the turntable as a small square PNG."""

@@ -87,7 +87,8 @@ def photographs_of(
         return PhotographSource(folder.frames, len(taken.names))
     (source,) = sources
     found = frames_of_videos(source, folder.scene, frames, progress, folder=folder.frames)
+    count = len(find_images(source)) + len(found.paths)
     if not found.paths:
         progress("using the photographs where they are", 1.0)
-        return PhotographSource(source, len(find_images(source)))
-    return PhotographSource(source, len(find_images(source)) + len(found.paths), frames, folder.frames)
+        return PhotographSource(source, count)
+    return PhotographSource(source, count, frames, folder.frames)

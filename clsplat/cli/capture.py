@@ -22,8 +22,8 @@ from clsplat.config.training import TrainConfig
 class CaptureVerb(Verb):
     """Turn photos or videos into a trained model, with its report, thumbnail and turntable.
 
-    The stages are those of clsplat sfm, train --auto, report, thumbnail and render. After Ctrl-C the same command goes
-    on in the stage that was under way.
+    It does the work of clsplat sfm, train --auto, report, thumbnail and render, one after the other. After Ctrl-C the
+    same command goes on in the stage that was interrupted.
     """
 
     input: Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT")]

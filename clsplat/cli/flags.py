@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flags of a verb, read from its dataclass: grouped help, and suggestions for misspelt flags.
 
-tyro makes and parses the flags themselves (`parse` in `clsplat/cli/parsing.py`); the names here are those of tyro.
+tyro makes and parses the flags themselves (`parse` in `clsplat/cli/parsing.py`). The names here must be the same as
+tyro's.
 """
 
 from __future__ import annotations

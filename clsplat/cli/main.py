@@ -27,7 +27,7 @@ from clsplat.version import package_version
 def main(arguments: Sequence[str] | None = None, services: Services | None = None) -> int:
     """Run one command line, by default `sys.argv`. Returns the exit status.
 
-    services: functions that do the work of the verbs; None for those of this package.
+    services: functions that do the work of the verbs. With None, they are imported from this package.
     """
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.errors import InputError
 from clsplat.images.decoders.decoded_photo import EXIF_ORIENTATION_ATTRIBUTE
-from clsplat.images.reading import open_image
+from clsplat.images.exif import header_of
 
 MAX_METADATA_BYTES = 1 << 18
 """Number of bytes at the beginning of a file that are searched for a maker note and XMP."""
@@ -50,13 +49,8 @@ class GpsPosition:
 
 def gps_of(path: Path) -> GpsPosition | None:
     """Return the position in a photograph's EXIF; None if EXIF has no valid one, or the file cannot be read."""
-    try:
-        source = open_image(path)
-    except InputError:
-        return None
-    spec = source.spec()
-    source.close()
-    if spec.get_string_attribute("GPS:Status") == "V":  # the device had no position ("void")
+    spec = header_of(path)
+    if spec is None or spec.get_string_attribute("GPS:Status") == "V":  # the device had no position ("void")
         return None
     latitude = _degrees(spec, "Latitude", "S", 90.0)
     longitude = _degrees(spec, "Longitude", "W", 180.0)
@@ -117,12 +111,9 @@ def _orientation(path: Path, *, upright: bool) -> int:
 
     upright: as for `gravity_of`. The decoded pixels of HEIF and AVIF, as stored, are upright already.
     """
-    try:
-        source = open_image(path)
-    except InputError:
+    spec = header_of(path)
+    if spec is None:
         return 0
-    spec = source.spec()
-    source.close()
     if orientation := int(spec.get_int_attribute("Orientation", 0)):
         return orientation if upright or orientation not in _PICTURE_FROM_PHONE else 1
     return int(spec.get_int_attribute(EXIF_ORIENTATION_ATTRIBUTE, 1))

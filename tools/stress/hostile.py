@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from camera_files import write_avif, write_dng, write_heic
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
+from hostile_photographs import CAMERA_WRITERS, HAS_CAMERA_DECODERS, make_camera_image
 from hostile_videos import make_frames, make_video, read_frames, read_video
 from ksplats import ksplat
 from models import random_gaussians
@@ -223,8 +223,6 @@ def make_cameras_json(folder: Path) -> None:
 UNREAD = ("pcx",)
 """Kinds of `other_pictures.KINDS` that OpenImageIO does not open."""
 FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
-CAMERA_WRITERS: dict[str, Callable[[Path, Any], Path]] = {"heic": write_heic, "avif": write_avif, "dng": write_dng}
-HAS_CAMERA_DECODERS = bool(find_spec("pillow_heif") and find_spec("rawpy"))
 
 
 def make_image(folder: Path, extension: str) -> None:
@@ -232,12 +230,6 @@ def make_image(folder: Path, extension: str) -> None:
     pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
     kind = "float" if extension in ("exr", "hdr") else "uint8"
     write_pixels(folder / f"picture.{extension}", pixels, kind, {"Orientation": 6})
-
-
-def make_camera_image(folder: Path, extension: str) -> None:
-    """Write a picture in a format of phones and cameras."""
-    pixels = np.random.default_rng(2).integers(0, 256, (28, 36, 3), np.uint8)
-    CAMERA_WRITERS[extension](folder / f"picture.{extension}", pixels)
 
 
 def make_other_image(folder: Path, kind: str) -> None:

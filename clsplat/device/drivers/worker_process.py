@@ -34,7 +34,7 @@ _SIGKILL, _SIGTERM = -9, -15
 
 
 class TrialInterrupted(Interrupted):
-    """Raised in a thread that waits for a worker process when this program is told to end, by Ctrl-C or a signal."""
+    """Error in a thread that waits for a worker process, because Ctrl-C or a signal asks this program to end."""
 
 
 class WorkerEndedError(Exception):

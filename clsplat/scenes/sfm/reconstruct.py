@@ -9,7 +9,7 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from clsplat.config.masks import MaskUse
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
@@ -41,9 +41,9 @@ MIN_SFM_PHOTOS = 3
 SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 """Choices of `SfmSettings.camera_model`."""
-SFM_MAPPERS = ("auto", "global", "incremental")
+SFM_MAPPERS: tuple[str, ...] = get_args(Mapper)
 """Choices of `SfmSettings.mapper`."""
-SFM_FEATURES = ("sift", "aliked")
+SFM_FEATURES: tuple[str, ...] = get_args(Features)
 """Choices of `SfmSettings.features`."""
 
 
@@ -144,8 +144,8 @@ def reconstruct(
     videos = frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to)
     paths, copies, left_out = _files(images, output, videos)
     mask_files = _masks(images, paths, masks)
-    settings, weights = _with_weights(settings)
-    asked = f"{settings}{_described(masks, mask_files)}{_identity(weights)}{videos.fingerprint}"
+    settings = _with_weights(settings)
+    asked = f"{settings}{_described(masks, mask_files)}{_identity(settings.weights)}{videos.fingerprint}"
     fingerprint = sfm_photos.fingerprint(images, paths, asked)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
@@ -160,7 +160,7 @@ def reconstruct(
         work = Path(folder)
         photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
         masked = _staged_masks(photos, mask_files, masks, work)
-        task = sfm_task(settings, photos, masked, videos.sequences, work, workers) | {"weights": str(weights or "")}
+        task = sfm_task(settings, photos, masked, videos.sequences, work, workers)
         result = _recovered(images, len(photos), run_worker(task, work, report))
         turn_new(work / "result", images, settings.frame, images)
         _write_record(work / "result", fingerprint, photos, result)
@@ -196,15 +196,17 @@ def _recovered(images: Path, count: int, answer: dict[str, Any]) -> dict[str, An
     return dict(answer["result"])
 
 
-def _with_weights(settings: SfmSettings) -> tuple[SfmSettings, Path | None]:
-    """Return the settings and the file of weights. If weights cannot be fetched, the settings choose SIFT features."""
+def _with_weights(settings: SfmSettings) -> SfmSettings:
+    """Return the settings with the file of weights. If weights cannot be fetched, the settings choose SIFT features."""
     weights = learned_weights(settings.weights) if settings.features == "aliked" else None
-    return (settings if weights else replace(settings, features="sift", weights=None)), weights
+    if weights is None:
+        return replace(settings, features="sift", weights=None)
+    return replace(settings, weights=str(weights))
 
 
-def _identity(weights: Path | None) -> str:
-    """Return the digest of the weights as text for the fingerprint, empty without weights."""
-    return f" {hashlib.sha256(weights.read_bytes()).hexdigest()}" if weights else ""
+def _identity(weights: str | None) -> str:
+    """Return the digest of the file of weights as text for the fingerprint, empty without weights."""
+    return f" {hashlib.sha256(Path(weights).read_bytes()).hexdigest()}" if weights else ""
 
 
 def _described(masks: MaskUse | None, mask_files: dict[str, Path]) -> str:
@@ -277,6 +279,7 @@ def sfm_task(
 ) -> dict[str, Any]:
     """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON.
 
+    settings: with the file of weights (`_with_weights`).
     masked: names of the photographs with a mask.
     sequences: names of each video's frames, in display order.
     work: folder for the photographs, masks and intermediate files.
@@ -289,7 +292,7 @@ def sfm_task(
         "groups": sfm_photos.camera_groups(photos, settings.shared_camera),
         "sequences": [[name for name in frames if name in names] for frames in sequences],
         "features": settings.features,
-        "weights": "",
+        "weights": settings.weights or "",
         "matching": settings.matching,
         "mapper": settings.mapper,
         "camera_model": settings.camera_model,

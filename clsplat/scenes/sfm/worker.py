@@ -34,8 +34,7 @@ reproducible.
 
 Mapping on several threads adds in varying order. Matching on several threads multiplies matrices in each of them. The
 OpenBLAS of pycolmap 4.2 is built without locks, so two threads may use the same scratch memory. Then some features are
-matched wrongly, once in about 70 reconstructions on a busy machine. Beside one thread that
-matches, another one verifies the matches.
+matched wrongly, once in about 70 reconstructions on a busy machine. Matches are verified in another thread.
 """
 GLOBAL_FOLDER = "sparse-global"
 """Folder in the worker's folder for the models of the global mapper."""
