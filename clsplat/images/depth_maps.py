@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 from clsplat.arrays import Float32
 from clsplat.errors import InputError
 from clsplat.files.documents import open_input
-from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, image_size, one_line, open_image, stored_range
+from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, one_line, open_image, stored_size
 
 DEPTH_MAP_SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".npy")
 """Lower-case extensions of the depth maps that a folder search finds."""
@@ -31,8 +31,10 @@ def map_header(path: Path) -> tuple[int, int, bool]:
     if path.suffix.lower() == ".npy":
         array = _numpy(path)
         return array.shape[1], array.shape[0], array.dtype.kind in "iu"
-    highest, _ = stored_range(path)
-    return *image_size(path, orient=False), highest in INTEGER_MAXIMA.values()
+    source = open_image(path)
+    size, kind = stored_size(path, source), str(source.spec().format)
+    source.close()
+    return *size, kind in INTEGER_MAXIMA
 
 
 def read_map(path: Path) -> Float32:

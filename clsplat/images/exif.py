@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import InputError
-from clsplat.images.reading import open_image
+from clsplat.images.reading import open_photograph
 
 _EXIF_ISO_TAGS = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings", "Exif:ISOSpeed")
 
@@ -20,7 +20,7 @@ _EXIF_ISO_TAGS = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings", "Exif:
 def header_of(path: Path) -> Any | None:
     """Return OpenImageIO's specification of a photograph, with its EXIF data; None if the file cannot be read."""
     try:
-        source = open_image(path)
+        source = open_photograph(path)
     except InputError:
         return None
     spec = source.spec()

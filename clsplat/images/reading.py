@@ -154,15 +154,22 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
     Raises InputError if the file is missing, is not an image, or is a truncated PNG.
     """
-    source = open_image(path)
-    spec = source.spec()
+    source = open_photograph(path)
+    width, height = stored_size(path, source)
+    is_turned = orient and _orientation(source.spec()) >= 5
     source.close()
-    width, height = spec.full_width, spec.full_height
-    if source.format_name() != "openexr":
-        width, height = spec.width, spec.height
-    if source.format_name() == "png":
+    return (height, width) if is_turned else (width, height)
+
+
+def stored_size(path: Path, source: Any) -> tuple[int, int]:
+    """Return width and height of an open image before its EXIF orientation is applied; of an EXR's display window.
+
+    source: as from `open_image`. Raises InputError for a truncated PNG.
+    """
+    spec, kind = source.spec(), source.format_name()
+    if kind == "png":
         _check_png_is_whole(path)
-    return (height, width) if orient and _orientation(spec) >= 5 else (width, height)
+    return (spec.full_width, spec.full_height) if kind == "openexr" else (spec.width, spec.height)
 
 
 def stored_range(path: Path) -> tuple[int, bool]:
@@ -170,7 +177,7 @@ def stored_range(path: Path) -> tuple[int, bool]:
 
     Raises InputError if the file is missing, not an image, or has an implausible size.
     """
-    source = open_image(path)
+    source = open_photograph(path)
     dtype, kind = np.dtype(str(source.spec().format)), source.format_name()
     source.close()
     return (int(np.iinfo(dtype).max) if dtype.kind == "u" else 0), kind not in (
@@ -193,7 +200,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     Raises InputError, with the decoder's reason, if the file is missing, not an image, damaged or truncated. Also
     raises InputError for unsupported channels and non-finite values.
     """
-    source = open_image(path)
+    source = open_photograph(path)
     spec = source.spec()
     if source.format_name() == "png":
         _check_png_is_whole(path)
@@ -256,26 +263,64 @@ def alpha_of(spec: Any) -> int:
     return names.index("A") if index >= 0 and "A" in names else -1
 
 
+def open_photograph(path: Path) -> Any:
+    """Open a picture of any kind, as from a camera, like `open_image`.
+
+    HEIF, AVIF and raw photographs, which OpenImageIO does not decode, give a `DecodedPhoto` with the same methods.
+    """
+    head = _first_bytes(path)
+    decoder = decoder_of(path, head)
+    if decoder is None:
+        return _opened_by_oiio(path, head, wrong_contents(path, head))
+    _check_file_size(path, known=True)
+    return _with_plausible_header(path, decoder.open(path))
+
+
 def open_image(path: Path) -> Any:
     """Open an image and check its header. Returns OpenImageIO's input, which does not premultiply straight alpha.
 
-    HEIF, AVIF and raw photographs, which OpenImageIO does not decode, give a `DecodedPhoto` with the same methods.
+    Images with data in their pixels, such as depth maps and STMaps, are opened by this function. `open_photograph` also
+    opens formats that only cameras write.
 
     Raises InputError if the file is missing, not an image, or has an implausible size.
     """
+    return _opened_by_oiio(path, _first_bytes(path))
+
+
+def _first_bytes(path: Path) -> bytes:
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
-    size = path.stat().st_size
     with open_input(path, "a picture") as file:
-        head = file.read(PHOTO_HEAD_BYTES)
-    decoder = decoder_of(path, head)
-    known = decoder is not None or head.startswith(IMAGE_SIGNATURES)
+        return file.read(PHOTO_HEAD_BYTES)
+
+
+def _opened_by_oiio(path: Path, head: bytes, wrong: InputError | None = None) -> Any:
+    """Open an image like `open_image`.
+
+    head: first bytes of the file. wrong: the error to raise if they are of no image; None for OpenImageIO's reason.
+    """
+    _check_file_size(path, known=head.startswith(IMAGE_SIGNATURES))
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(native_name(path), hints)
+    if source is None:
+        reason = one_line(error_of(oiio))
+        raise wrong or InputError(f"{path}: does not decode: {reason}; expected an image")
+    return _with_plausible_header(path, source)
+
+
+def _check_file_size(path: Path, *, known: bool) -> None:
+    """Raise InputError for a file that is too large. known: True if the file begins like an image."""
+    size = path.stat().st_size
     if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
         raise InputError(
             f"{path}: has {size} bytes, expected a picture in a known format, of at most {MAX_IMAGE_FILE_BYTES} bytes"
         )
-    source = decoder.open(path) if decoder else _opened_by_oiio(path, head)
-    spec = source.spec()
+
+
+def _with_plausible_header(path: Path, source: Any) -> Any:
+    """Return an open image. Raises InputError if its header gives an implausible size."""
+    spec, size = source.spec(), path.stat().st_size
     shown = max(spec.width, 0) * max(spec.height, 0), max(spec.full_width, 0) * max(spec.full_height, 0)
     floats = max(shown) * spec.nchannels
     if spec.depth > 1 or min(spec.width, spec.height, spec.full_width, spec.full_height) < 1:
@@ -285,16 +330,6 @@ def open_image(path: Path) -> Any:
             f"{path}: its header gives {spec.width} x {spec.height} pixels of {spec.nchannels} channels and a display "
             f"window of {spec.full_width} x {spec.full_height}, too many for a file of {size} bytes; is it damaged?"
         )
-    return source
-
-
-def _opened_by_oiio(path: Path, head: bytes) -> Any:
-    hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(native_name(path), hints)
-    if source is None:
-        reason = one_line(error_of(oiio))
-        raise wrong_contents(path, head) or InputError(f"{path}: does not decode: {reason}; expected an image")
     return source
 
 

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from clsplat.errors import InputError
+from clsplat.images import depth_maps, stmap
 from clsplat.images.decoders import raw
 from clsplat.images.decoders.decoded_photo import DecodedPhoto, photo_spec
 from clsplat.images.decoders.orientation import turned
 from clsplat.images.decoders.photo_decoders import DECODED_PHOTO_EXTENSIONS, PHOTO_DECODERS, without_converted
 from clsplat.images.decoders.tiff_tags import is_cut_off
 from clsplat.images.exif import exposure_of, lens_of
-from clsplat.images.reading import find_images, image_size, open_image, read_image, stored_range
+from clsplat.images.reading import find_images, image_size, open_photograph, read_image, stored_range
 
 pytestmark = [pytest.mark.needs("pillow_heif"), pytest.mark.needs("rawpy")]
 
@@ -115,12 +116,18 @@ def test_lossy_heic_and_webp(tmp_path: Path) -> None:
     assert [stored_range(tmp_path / name) for name in ("a.heic", "a.webp")] == [(255, False)] * 2
 
 
+def test_data_are_no_photographs(tmp_path: Path) -> None:
+    heic(tmp_path / "a.heic")
+    for read in (depth_maps.map_header, depth_maps.read_map, stmap.read_stmap):
+        refuses("a.heic: does not decode: .*expected an image", read, tmp_path / "a.heic")
+
+
 def test_ten_bits_of_heic_stay_ten_bits(tmp_path: Path) -> None:
     levels = np.repeat(np.arange(1024, dtype=np.uint16).reshape(32, 32, 1), 3, axis=2)
     path = write_heic(tmp_path / "a.heic", levels)
     np.testing.assert_array_equal(read_image(path), levels * np.float32(1 / 1023))
     assert stored_range(path) == (65535, False)
-    source = open_image(path)
+    source = open_photograph(path)
     whole = source.read_image(source.spec().format)
     np.testing.assert_array_equal(whole, np.rint(levels * (65535 / 1023)))
     assert whole.dtype == np.uint16
@@ -218,14 +225,14 @@ def test_camera_lens_and_exposure(tmp_path: Path) -> None:
     write_avif(tmp_path / "a.avif", SMOOTH, exif)
     Pillow.fromarray(SMOOTH).save(tmp_path / "a.jpg", exif=exif)
     for name in ("a.heic", "a.avif", "a.jpg"):
-        spec = open_image(tmp_path / name).spec()
+        spec = open_photograph(tmp_path / name).spec()
         assert lens_of(spec) == ("Acme", "Cam 1", "Acme wide", "6.765", "24")
         assert exposure_of(tmp_path / name) == pytest.approx(np.log2(0.01 * 200 / 16))
         assert spec.getattribute("GPS:Latitude") == (47, 30, 0) and spec.getattribute("GPS:LongitudeRef") == "E"
     write_dng(tmp_path / "a.dng", np.zeros((HEIGHT, WIDTH, 3)), focal=(50, 75))
-    assert lens_of(open_image(tmp_path / "a.dng").spec()) == ("Acme", "Cam 1", "", "50.000", "75")
+    assert lens_of(open_photograph(tmp_path / "a.dng").spec()) == ("Acme", "Cam 1", "", "50.000", "75")
     write_heic(tmp_path / "b.heic", SMOOTH, b"Exif\0\0MM\0*\xff\xff\xff\xff")
-    assert lens_of(open_image(tmp_path / "b.heic").spec()) == ("",) * 5
+    assert lens_of(open_photograph(tmp_path / "b.heic").spec()) == ("",) * 5
     assert exposure_of(tmp_path / "b.heic") is None
 
 

@@ -30,7 +30,7 @@ from clsplat.images.decoders.photo_decoders import (
     without_converted,
 )
 from clsplat.images.exif import lens_of
-from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_image, opened
+from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_photograph, opened
 from clsplat.images.writing import jpeg_room
 from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 
@@ -174,7 +174,7 @@ def stage_photos(
 def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) -> Photo:
     if not is_file(path):
         raise InputError(f"{path}: cannot be decoded as an image: is not a regular file")
-    source = open_image(path)
+    source = open_photograph(path)
     try:
         spec, kind = source.spec(), source.format_name()
         pixels = source.read_image(spec.format)
