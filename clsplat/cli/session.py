@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
     from clsplat.scenes.analysis.photo_findings import Finding
-    from clsplat.scenes.orientation.frame_record import SceneFrame
+    from clsplat.scenes.dataset import SceneFrame
     from clsplat.scenes.scene import Scene
 
 

@@ -271,56 +271,47 @@ def open_photograph(path: Path) -> Any:
     head = _first_bytes(path)
     decoder = decoder_of(path, head)
     if decoder is None:
-        return _opened_by_oiio(path, head, wrong_contents(path, head))
-    _check_file_size(path, known=True)
-    return _with_plausible_header(path, decoder.open(path))
+        return open_image(path, wrong_contents(path, head))
+    source = decoder.open(path)
+    _check_header(path, source.spec())
+    return source
 
 
-def open_image(path: Path) -> Any:
+def open_image(path: Path, wrong: InputError | None = None) -> Any:
     """Open an image and check its header. Returns OpenImageIO's input, which does not premultiply straight alpha.
 
     Images with data in their pixels, such as depth maps and STMaps, are opened by this function. `open_photograph` also
     opens formats that only cameras write.
 
+    wrong: the error for a file that OpenImageIO cannot open; None for one with OpenImageIO's reason.
     Raises InputError if the file is missing, not an image, or has an implausible size.
     """
-    return _opened_by_oiio(path, _first_bytes(path))
-
-
-def _first_bytes(path: Path) -> bytes:
-    if not is_file(path):
-        raise InputError(f"{path}: no such image file")
-    with open_input(path, "a picture") as file:
-        return file.read(PHOTO_HEAD_BYTES)
-
-
-def _opened_by_oiio(path: Path, head: bytes, wrong: InputError | None = None) -> Any:
-    """Open an image like `open_image`.
-
-    head: first bytes of the file. wrong: the error to raise if they are of no image; None for OpenImageIO's reason.
-    """
-    _check_file_size(path, known=head.startswith(IMAGE_SIGNATURES))
+    known, size = _first_bytes(path).startswith(IMAGE_SIGNATURES), path.stat().st_size
+    if size > MAX_UNSIGNED_IMAGE_BYTES and not known:
+        raise InputError(f"{path}: has {size} bytes that do not begin like an image, expected a picture")
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:
         reason = one_line(error_of(oiio))
         raise wrong or InputError(f"{path}: does not decode: {reason}; expected an image")
-    return _with_plausible_header(path, source)
+    _check_header(path, source.spec())
+    return source
 
 
-def _check_file_size(path: Path, *, known: bool) -> None:
-    """Raise InputError for a file that is too large. known: True if the file begins like an image."""
+def _first_bytes(path: Path) -> bytes:
+    """Return the first PHOTO_HEAD_BYTES of a file. Raises InputError if the file is missing or too large."""
+    if not is_file(path):
+        raise InputError(f"{path}: no such image file")
+    if (size := path.stat().st_size) > MAX_IMAGE_FILE_BYTES:
+        raise InputError(f"{path}: has {size} bytes, expected a picture of at most {MAX_IMAGE_FILE_BYTES} bytes")
+    with open_input(path, "a picture") as file:
+        return file.read(PHOTO_HEAD_BYTES)
+
+
+def _check_header(path: Path, spec: Any) -> None:
+    """Raise InputError for a header that gives an implausible size. spec: OpenImageIO's specification of the image."""
     size = path.stat().st_size
-    if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
-        raise InputError(
-            f"{path}: has {size} bytes, expected a picture in a known format, of at most {MAX_IMAGE_FILE_BYTES} bytes"
-        )
-
-
-def _with_plausible_header(path: Path, source: Any) -> Any:
-    """Return an open image. Raises InputError if its header gives an implausible size."""
-    spec, size = source.spec(), path.stat().st_size
     shown = max(spec.width, 0) * max(spec.height, 0), max(spec.full_width, 0) * max(spec.full_height, 0)
     floats = max(shown) * spec.nchannels
     if spec.depth > 1 or min(spec.width, spec.height, spec.full_width, spec.full_height) < 1:
@@ -330,7 +321,6 @@ def _with_plausible_header(path: Path, source: Any) -> Any:
             f"{path}: its header gives {spec.width} x {spec.height} pixels of {spec.nchannels} channels and a display "
             f"window of {spec.full_width} x {spec.full_height}, too many for a file of {size} bytes; is it damaged?"
         )
-    return source
 
 
 @contextmanager

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float64
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.store import ChunkStore
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
@@ -40,8 +39,8 @@ from clsplat.runs.settings import (
     config_text,
     read_config,
 )
-from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
-from clsplat.scenes.readers.scene_frame import frame_of_files
+from clsplat.scenes.dataset import SOURCE_FRAME, SceneFrame
+from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
 
 KEPT_CHECKPOINTS = 2
@@ -133,11 +132,6 @@ class Run:
         """Frame of the run's scene and model, from frame.json; None without this file. Raises InputError."""
         return read_frame(self.path) if (self.path / FRAME_RECORD_FILE).exists() else None
 
-    def keep_frame(self, frame: SceneFrame) -> None:
-        """Write frame.json, unless the frame is the one that the scene's cameras had first."""
-        if not frame.is_source:
-            write_frame(self.path, frame)
-
     def is_scene(self, path: Path) -> bool:
         """True if `path` is the run's scene, or what structure from motion made of it."""
         if self.scene is None:
@@ -146,7 +140,7 @@ class Run:
         return other in (own, reconstruction_folder(own))
 
     def frame_for(self, path: Path) -> FrameUse | SceneFrame:
-        """Return the frame in which the scene `path` fits the model: of the run's own scene, the model's frame.
+        """Return the frame in which a scene or its cameras fit the model: of the run's own scene, the model's frame.
 
         The scene's files may have been turned since the training. Other scenes keep the frame of their files. Raises
         InputError for a damaged frame.json.
@@ -161,16 +155,6 @@ class Run:
         Raises InputError for a damaged frame.json.
         """
         return self.frame or (SOURCE_FRAME if self.checkpoints() else self.config.frame_use)
-
-    def change_of(self, cameras: Path) -> Float64 | None:
-        """Return the similarity (4, 4) from the frame of a scene's files to the model's.
-
-        cameras: the scene's folder or file. None if it is not the run's scene, or if the frames are equal. Raises
-          InputError.
-        """
-        if not self.is_scene(cameras):
-            return None
-        return (self.frame or SOURCE_FRAME).change_from(frame_of_files(cameras) if cameras.is_dir() else SOURCE_FRAME)
 
     def keep_config(self, config: TrainConfig) -> None:
         """Write config.toml if the settings in `config` differ from the settings in the file."""

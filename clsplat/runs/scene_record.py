@@ -18,6 +18,7 @@ from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import parse_json, read_document, short_digest
 from clsplat.runs.checkpoints import scene_of
+from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.version import package_version
 
 if TYPE_CHECKING:
@@ -201,16 +202,20 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
     """Write scene.json, unless the run is resumed and its scene.json was made at the same --resolution. Warns if a
-    resumed run has no scene.json."""
+    resumed run has no scene.json.
+
+    Also writes frame.json, unless the scene has the frame that its cameras had first.
+    """
     known = read(run) if resuming else None
-    if known is not None and known["resolution"] == run.config.resolution:
-        return
     if known is None and resuming and run.checkpoints():
         warn(
             f"{run.path}: has no {SCENE_RECORD_FILE_NAME}, like runs of earlier versions: it is not known whether this "
             "is the scene that it began with; this scene is recorded now"
         )
-    write(run, scene)
+    if known is None or known["resolution"] != run.config.resolution:
+        write(run, scene)
+    if not scene.frame.is_source:
+        atomic_write(run.path / FRAME_RECORD_FILE, scene.frame.content())
 
 
 def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:

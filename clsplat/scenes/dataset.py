@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of a data set in any layout: images with lenses and poses, and points. Also undistortion of pictures.
+"""Contents of a data set in any layout: images with lenses and poses, points, and their frame; and undistortion.
 
 The camera models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_from_cam`, `undistort_camera`).
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,6 +247,62 @@ class PosedImage:
         return self.listed or self.name
 
 
+@dataclass(frozen=True, eq=False)
+class SceneFrame:
+    """The coordinate frame of a scene, relative to the source's: the frame that its cameras had first, as from COLMAP.
+
+    world_from_source: (4, 4), similarity from the source's frame to the world.
+    upright: True if the world's up is -y.
+    metres: True if world units are metres.
+    origin: latitude and longitude in degrees and altitude in metres of the world's origin; () if unknown. If known,
+        the world's x axis points east, and z north.
+    up_note, scale_note: what the up direction and the unit come from, for the user; "" if neither was set.
+    """
+
+    world_from_source: Float64 = field(default_factory=lambda: np.eye(4))
+    upright: bool = False
+    metres: bool = False
+    origin: tuple[float, ...] = ()
+    up_note: str = ""
+    scale_note: str = ""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sources of the axes and the unit, one line each."""
+        return [note for note in (self.up_note, self.scale_note) if note]
+
+    @property
+    def is_source(self) -> bool:
+        """True if the frame is the source's."""
+        return np.array_equal(self.world_from_source, np.eye(4))
+
+    def change_from(self, other: SceneFrame) -> Float64 | None:
+        """Return the similarity (4, 4) from another frame of the same source to this one; None if they are equal."""
+        if np.array_equal(self.world_from_source, other.world_from_source):
+            return None
+        return np.asarray(self.world_from_source @ np.linalg.inv(other.world_from_source))
+
+    def document(self) -> dict[str, Any]:
+        """Return the values of the frame's record, frame.json (`scenes.orientation.frame_record`)."""
+        return {
+            "clsplat_frame": 1,
+            "world_from_source": self.world_from_source.tolist(),
+            "upright": self.upright,
+            "metres": self.metres,
+            "origin": list(self.origin),
+            "up_note": self.up_note,
+            "scale_note": self.scale_note,
+        }
+
+    def content(self) -> bytes:
+        """Return the content of frame.json."""
+        return (json.dumps(self.document(), indent=2) + "\n").encode()
+
+
+SOURCE_FRAME = SceneFrame()
+"""Frame of a scene that was neither turned nor scaled."""
+
+
 @dataclass(eq=False)
 class DataSet:
     """Images and points of a data set.
@@ -254,6 +312,7 @@ class DataSet:
     box: corners (low, high) of instant-ngp's volume in world units; None for other data sets.
     missing: names of listed pictures that do not exist and are left out.
     clouds: point files that the data set does not name. The first one is used if `points` is empty.
+    frame: the frame of the images and points.
     """
 
     images: list[PosedImage]
@@ -262,6 +321,7 @@ class DataSet:
     box: tuple[Float64, Float64] | None = None
     missing: list[str] = field(default_factory=list)
     clouds: list[Path] = field(default_factory=list)
+    frame: SceneFrame = SOURCE_FRAME
 
 
 def check_lens(lens: Lens, where: str) -> Lens:

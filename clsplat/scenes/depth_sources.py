@@ -16,7 +16,7 @@ from clsplat.config.depth import DepthUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file
 from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
-from clsplat.models.edit import decompose, moved
+from clsplat.models.edit import moved
 from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of, tracked_in_view
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
@@ -125,11 +125,10 @@ def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
         )
     nothing = (np.empty((0, 3)), np.empty(0))
     lenses, known = {view.name: view.lens for view in scene.views}, {}
-    scale = 1.0 if scene.world_from_files is None else decompose(scene.world_from_files)[0]
     for name, path in files.items():
         width, height, whole = map_header(path)
         _check_shape(path, width, height, lenses[name])
-        known[name] = KnownDepth(*nothing, path, scale * (use.unit if whole else 1.0), whole=whole)
+        known[name] = KnownDepth(*nothing, path, scene.file_unit * (use.unit if whole else 1.0), whole=whole)
     if use.maps == "relative":
         return _fitted(scene, known)
     return {name: one for name, one in known.items() if one.measured(read_map(_path(one))).any()}

@@ -26,12 +26,10 @@ from clsplat.images.reading import image_size
 from clsplat.models.edit import decompose
 from clsplat.progress import Progress
 from clsplat.scenes.camera_checks import camera_checks
-from clsplat.scenes.dataset import DataSet, Lens, PosedImage
+from clsplat.scenes.dataset import DataSet, Lens, PosedImage, SceneFrame
 from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transforms
-from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
-from clsplat.scenes.readers.scene_frame import frame_of_files
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
@@ -127,7 +125,6 @@ class _SceneFiles:
     source: the folder from which the data set was read. For photographs it is the result of structure from motion.
     smaller: folders of downscaled pictures that may be used instead of the data set's pictures.
     masks: the meaning of masks and alpha channels in `source`.
-    frame: the frame of `data`.
     world_from_files: (4, 4), the similarity from the frame of the files to that of `data`; None if they are equal.
     """
 
@@ -135,7 +132,6 @@ class _SceneFiles:
     source: Path
     smaller: Sequence[Path]
     masks: MaskUse
-    frame: SceneFrame = SOURCE_FRAME
     world_from_files: Float64 | None = None
 
 
@@ -161,21 +157,22 @@ def _read(
         folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)
-    return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks, frame_of_files(folder))
+    return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)
 
 
 def _reframed(files: _SceneFiles, path: Path, frame: FrameUse | SceneFrame) -> _SceneFiles:
     """Return the data set in another frame. frame: as for `load_scene`."""
+    data = files.data
     if isinstance(frame, FrameUse):
         frame.check()
         if not frame:
             return files
-        photographs = {image.name: image.path for image in files.data.images}
-        frame = new_frame(path, files.data, photographs, frame, files.frame, turned=False)
-    change = frame.change_from(files.frame)
-    if change is None:
-        return replace(files, frame=frame)
-    return replace(files, data=in_frame(files.data, change), frame=frame, world_from_files=change)
+        photographs = {image.name: image.path for image in data.images}
+        frame = new_frame(path, data, photographs, frame, data.frame, turned=False)
+    change = frame.change_from(data.frame)
+    if change is not None:
+        data = in_frame(data, change)
+    return replace(files, data=replace(data, frame=frame), world_from_files=change)
 
 
 def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[int, int], lenses: Lenses) -> list[View]:
@@ -221,10 +218,10 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     name = whole.name if path.is_dir() else whole.stem if kind == "photos" else whole.parent.name  # a video's own name
     scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
     scene.missing = tuple(data.missing)
-    scene.frame, scene.world_from_files = files.frame, files.world_from_files
+    scene.frame, scene.world_from_files = data.frame, files.world_from_files
     if files.world_from_files is not None:
-        scale, _, shift = decompose(files.world_from_files)
-        scene.bounds = shift - scale * cube, shift + scale * cube
+        scene.file_unit, _, shift = decompose(files.world_from_files)
+        scene.bounds = shift - scene.file_unit * cube, shift + scene.file_unit * cube
     if len(scene.points) == 0:
         scene = with_cloud_beside(scene)
         if not len(scene.points) and kind in ("colmap", "photos"):

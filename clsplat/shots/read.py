@@ -15,13 +15,16 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
+from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import is_file, parse_json, read_document
 from clsplat.gaussians import Gaussians
+from clsplat.models.edit import decompose, transform_camera
 from clsplat.models.formats.usd import USD_SUFFIXES
 from clsplat.scenes.camera_checks import cameras_of
-from clsplat.scenes.dataset import PosedImage
+from clsplat.scenes.dataset import SOURCE_FRAME, PosedImage, SceneFrame
+from clsplat.scenes.orientation.frame_record import read_frame
 from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO, stray_cameras
 from clsplat.scenes.readers import colmap, transforms
@@ -84,7 +87,7 @@ def choose_shot(
     lenses: Lenses = "undistort",
     applied: Collection[str] = (),
     distort: bool = False,
-    up: Float64 | None = None,
+    frame: FrameUse | SceneFrame = AS_IN_FILES,
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
@@ -93,7 +96,7 @@ def choose_shot(
     size, usd_camera, lenses: as in `read_shot`.
     applied: names of the USD stage's settings that the caller applies itself, so that they need no warning.
     distort: use the photographs' own cameras, including the distortion of their lenses.
-    up: up direction (3,) of the cameras' frame, for --path; None to estimate it.
+    frame: the frame that the shot gets: a model's, or AS_IN_FILES. The cameras must be of the model's own scene.
     Raises InputError.
     """
     if count is not None and path is None:
@@ -105,6 +108,7 @@ def choose_shot(
         shot = Shot(photographs(photographed(cameras, size)))
     else:
         shot = read_shot(cameras, size=size, usd_camera=usd_camera, lenses=lenses)
+    change, up = _change_and_up(cameras, frame)
     if path is not None:
         if not (first := shot.frames[0].camera).model.flat:
             raise InputError(
@@ -116,7 +120,28 @@ def choose_shot(
         shot = Shot(_path(path, near, count, up), (*shot.warnings, *told), unapplied=unapplied)
     if applied:
         shot = replace(shot, unapplied=tuple(text for text in shot.unapplied if text.partition(" (")[0] not in applied))
+    if change is not None:
+        moved = (replace(one, camera=transform_camera(one.camera, change)) for one in shot.frames)
+        shot = replace(shot, frames=tuple(moved))
     return shot
+
+
+def _change_and_up(cameras: Path, frame: FrameUse | SceneFrame) -> tuple[Float64 | None, Float64 | None]:
+    """Return the similarity (4, 4) from the frame of a scene's files to `frame`, and up (3,) in the frame of the files.
+
+    cameras, frame: as for `choose_shot`. The similarity is None if the frames are equal. Up is None if it is not known,
+        and for a file of cameras.
+    """
+    is_folder = cameras.is_dir()
+    model = find_model(cameras) if is_folder else None
+    files = SOURCE_FRAME if model is None else read_frame(model)
+    wanted = frame if isinstance(frame, SceneFrame) else files
+    change = wanted.change_from(files)
+    if files.upright:
+        return change, np.array(COLMAP_UP)
+    if change is None or not wanted.upright or not is_folder:
+        return change, None
+    return change, decompose(change)[1].T @ COLMAP_UP
 
 
 def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:

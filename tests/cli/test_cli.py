@@ -22,7 +22,7 @@ from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.runs.run import Run
-from clsplat.scenes.orientation.frame_record import SOURCE_FRAME
+from clsplat.scenes.dataset import SOURCE_FRAME
 from clsplat.scenes.sfm.reconstruct import SfmSettings
 
 

@@ -23,7 +23,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images import frame_files as layers
 from clsplat.runs.run import Run
-from clsplat.scenes.orientation.frame_record import SOURCE_FRAME
+from clsplat.scenes.dataset import SOURCE_FRAME
 from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read

@@ -18,7 +18,7 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.config.orientation import FrameUse
-from clsplat.scenes.orientation.frame_record import SOURCE_FRAME
+from clsplat.scenes.dataset import SOURCE_FRAME
 from clsplat.scenes.orientation.level import COLMAP_UP, up_axis
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.orientation.plane import in_reach, level_plane

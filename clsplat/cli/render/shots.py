@@ -10,20 +10,15 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.cli.render.flags import RenderVerb
+from clsplat.config.orientation import AS_IN_FILES
 from clsplat.config.pictures import FramingConfig, PictureConfig, SamplingConfig
 from clsplat.config.stereo import EYES, StereoConfig
 from clsplat.errors import InputError
-from clsplat.models.edit import decompose, transform_camera
 from clsplat.models.formats.usd import USD_SUFFIXES
 from clsplat.runs.run import run_of
 from clsplat.runs.scene_record import own_cameras
-from clsplat.scenes.orientation.level import COLMAP_UP
-from clsplat.scenes.readers.scene_frame import frame_of_files
 from clsplat.sequence.job_models import JobModels
 from clsplat.sequence.task import Task
 from clsplat.shots import Shot, check_around, choose_shot, shot_around
@@ -56,10 +51,10 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
     """Return shots like `shots_asked`, from --cameras or --path. A still camera becomes a shot of a single frame."""
     pairs, size = flags.pairs, (flags.width, flags.height)
     paths = _stage_cameras(pairs, flags.cameras, flags.usd_camera) if pairs.of_stage else {}
+    run = None if flags.transform else run_of(flags.model)
     if flags.cameras is None:
         if flags.usd_camera is not None:
             raise InputError(f"--usd-camera {flags.usd_camera}: expected the USD stage in --cameras with it")
-        run = None if flags.transform else run_of(flags.model)
         own = own_cameras(run)
         check_around(flags.path, among_own=bool(own) and flags.up is None)  # report errors before models are loaded
         frame = None if run is None else run.frame
@@ -79,35 +74,10 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
             lenses=flags.lenses or "undistort",
             applied=[STEREO_ROLE_ATTRIBUTE] if paths else [],
             distort=flags.warp.distort,
-            up=_up_of_files(flags),
+            frame=AS_IN_FILES if run is None else run.frame_for(flags.cameras),
         )
         shots = [read(usd_camera=prim) for prim in paths.values() or [flags.usd_camera]]
-        shots = _in_frame_of_run(flags, shots)
     return _of_eyes(pairs, shots, paths)
-
-
-def _up_of_files(flags: RenderVerb) -> Float64 | None:
-    """Return the up direction (3,) of the frame of --cameras; None if it is not known."""
-    if flags.cameras is None or not flags.cameras.is_dir():
-        return None
-    if frame_of_files(flags.cameras).upright:
-        return np.array(COLMAP_UP)
-    run = None if flags.transform else run_of(flags.model)
-    if run is None or (frame := run.frame) is None or not frame.upright:
-        return None
-    change = run.change_of(flags.cameras)
-    return None if change is None else decompose(change)[1].T @ COLMAP_UP
-
-
-def _in_frame_of_run(flags: RenderVerb, shots: list[Shot]) -> list[Shot]:
-    """Return shots from the cameras of a run's own scene in the frame of the model, by `train --orient` and --scale."""
-    run = None if flags.transform or flags.cameras is None else run_of(flags.model)
-    if run is None or flags.cameras is None or (change := run.change_of(flags.cameras)) is None:
-        return shots
-    return [
-        replace(shot, frames=tuple(replace(one, camera=transform_camera(one.camera, change)) for one in shot.frames))
-        for shot in shots
-    ]
 
 
 def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str | None) -> dict[str, str]:

@@ -16,8 +16,7 @@ from clsplat.config.orientation import FrameUse, ScaleRule, parse_scale
 from clsplat.errors import InputError, warn
 from clsplat.images.geotags import GpsPosition, gps_of, gravity_of
 from clsplat.models.edit import decompose, moved, scaling
-from clsplat.scenes.dataset import DataSet, PosedImage
-from clsplat.scenes.orientation.frame_record import SceneFrame
+from clsplat.scenes.dataset import DataSet, PosedImage, SceneFrame
 from clsplat.scenes.orientation.known_length import metres_per_unit
 from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.orientation.positions import MapFit, fit_map, globe_position, up_from_gps

@@ -45,6 +45,7 @@ from clsplat.scenes.dataset import (
     given_in_parts,
     in_pixels,
 )
+from clsplat.scenes.orientation.frame_record import read_frame
 from clsplat.scenes.photo_names import is_legible, legible, match, slashed
 
 COLMAP_FILE_STEMS = ("cameras", "images", "points3D")
@@ -85,12 +86,13 @@ def find_model(folder: Path) -> Path | None:
 def read_model(folder: Path) -> DataSet:
     """Read the COLMAP model in `folder`: cameras, images and points3D, each from .bin if it exists, else from .txt.
 
-    Without points3D there are no points. Raises InputError that names the file if a file is missing, truncated, longer
-    than its contents, damaged, or has an unknown camera model. Warns of text files with fewer records than their
-    headers announce, and of text files newer than the binary file that is read.
+    Without points3D there are no points. frame.json gives the frame. Raises InputError that names the file if a file is
+    missing, truncated, longer than its contents, damaged, or has an unknown camera model. Warns of text files with
+    fewer records than their headers announce, and of text files newer than the binary file that is read.
     """
     images = _read_posed_images(folder)
-    return DataSet(images, *_read_points(folder)) if _file(folder, "points3D") else DataSet(images)
+    data = DataSet(images, *_read_points(folder)) if _file(folder, "points3D") else DataSet(images)
+    return replace(data, frame=read_frame(folder))
 
 
 def _read_posed_images(folder: Path) -> list[PosedImage]:
@@ -256,15 +258,13 @@ def _file(folder: Path, stem: str) -> Path | None:
             return path
     if not os.path.isdir(folder):  # noqa: PTH112  # Path.is_dir raises for a long name
         return None
-    lower = {
-        f"{stem}{extension}".lower() for extension in (".bin", ".txt")
-    }  # hierarchical-3d-gaussians writes points3d in lower case
+    # hierarchical-3d-gaussians writes points3d in lower case
+    lower = {f"{stem}{extension}".lower() for extension in (".bin", ".txt")}
     return next((path for path in sorted(folder.iterdir()) if path.name.lower() in lower and is_file(path)), None)
 
 
 def _require(folder: Path, stem: str) -> Path:
-    path = _file(folder, stem)
-    if path is None:
+    if (path := _file(folder, stem)) is None:
         raise InputError(f"{folder}: has no {stem}.bin or {stem}.txt, expected a COLMAP model with cameras and images")
     return path
 

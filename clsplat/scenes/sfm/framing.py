@@ -9,9 +9,10 @@ from pathlib import Path
 
 from clsplat.config.orientation import FrameUse, Orient
 from clsplat.errors import InputError, warn
-from clsplat.files.atomic import move_into_place
+from clsplat.files.atomic import atomic_write, move_into_place
 from clsplat.files.documents import is_file
-from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SceneFrame, read_frame, write_frame
+from clsplat.scenes.dataset import SceneFrame
+from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
 from clsplat.scenes.orientation.new_frame import new_frame
 from clsplat.scenes.readers.colmap import read_model
 
@@ -63,15 +64,14 @@ def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneF
     Raises InputError and warns like `new_frame`.
     """
     folder = scene / MODEL_FOLDER
-    present = read_frame(folder)
     if not use:
-        return present
+        return read_frame(folder)
     data = read_model(folder)
     files = {image.name: photograph_of(photos, image.name) for image in data.images}
-    frame = new_frame(where, data, files, use, present, turned=True)
-    change = frame.change_from(present)
+    frame = new_frame(where, data, files, use, data.frame, turned=True)
+    change = frame.change_from(data.frame)
     if change is None:
-        return present
+        return data.frame
     import pycolmap
 
     model = pycolmap.Reconstruction(folder)
@@ -81,7 +81,7 @@ def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneF
         made = work / "result"
         shutil.copytree(folder, made, ignore=shutil.ignore_patterns(FRAME_RECORD_FILE))
         model.write(made)
-        write_frame(made, frame)
+        atomic_write(made / FRAME_RECORD_FILE, frame.content())
         move_into_place(work, folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)
