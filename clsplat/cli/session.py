@@ -67,6 +67,7 @@ def load_scene(
     lenses: Lenses = "undistort",
     missing: Missing = "few",
     frame: FrameUse | SceneFrame = AS_IN_FILES,
+    frames: int | None = None,
 ) -> Scene:
     """Load the scene in the folder `path`, print its warnings, and return it.
 
@@ -83,6 +84,7 @@ def load_scene(
         missing=missing,
         progress=StageProgress(),
         frame=frame,
+        frames=frames,
     )
     for text in scene.warnings:
         warn(text)

@@ -15,9 +15,12 @@ import pytest
 from calls import Capture, refuses, warnings_of
 from needs import require
 from pictures import write_pixels
+from tiny import write_scene
 from walk_videos import sliding, walk, write_walk
 
 from clsplat.cli.main import main
+from clsplat.errors import InputError
+from clsplat.scenes import loading
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.scenes.sfm.video_frames import find_videos, frames_folder, reconstruction_folder
@@ -77,6 +80,34 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
     refuses("scene_frames: has frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
     sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
     assert len(tasks) == 2
+
+
+def test_training_takes_the_frames_that_sfm_made(
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    given: list[object] = []
+
+    def reconstruct(*paths: Any, frames: int | None, **named: Any) -> Path:
+        given.append(frames)
+        sfm.reconstruct(*paths, frames=frames, **named)
+        raise InputError("cameras are there")  # the fake worker writes no model to train on
+
+    monkeypatch.setattr(loading, "reconstruct", reconstruct)
+    walk_mp4 = Path(shutil.copy(video, tmp_path / "walk.mp4"))
+    assert main(["sfm", str(walk_mp4), "-o", str(tmp_path / "walk_colmap"), "--frames", "6"]) == 0
+    train = ["train", str(walk_mp4), "-o", str(tmp_path / "run")]
+    for more in ([], ["--frames", "6"]):
+        capsys.readouterr()
+        assert main([*train, *more]) == 2
+        assert "cameras are there" in capsys.readouterr().err
+    assert len(tasks) == 1, "the same frames, so the same cameras"
+    assert main([*train, "--frames", "5"]) == 2
+    assert "walk_frames: has frames of other videos, or another number of frames" in capsys.readouterr().err
+    assert given == [None, 6, 5]
+    assert main([*train, "--frames", "0"]) == 2
+    assert "--frames 0: expected at least 1" in capsys.readouterr().err
+    assert main(["train", str(write_scene(tmp_path / "scene")), *train[2:], "--frames", "5"]) == 2
+    assert "--frames 5: " in (said := capsys.readouterr().err) and "is a scene with cameras, expected a video" in said
 
 
 def test_videos_and_photographs_in_one_folder_are_several_cameras(

@@ -82,14 +82,14 @@ def take_frames(
 
     A frame's name is that of its video's file, followed by the number of the frame: walk.mp4/000123.jpg. The frames are
     upright, with the colours of photographs (`display_rgb`). The same videos give the same bytes again, and the
-    modification times of the videos. An existing folder with the frames of the same videos and the same `count` is used
-    again.
+    modification times of the videos. An existing folder with frames of the same videos is used again if it was made
+    with the same `count`, or if `count` is None.
 
     Each video is decoded twice: once for the choice, which depends on the whole video, and once for the chosen frames.
 
     root: folder below which the videos are named; by default the first video's folder.
     count: number of frames of each video; None for a number by the video's length and motion.
-    overwrite: replace frames of other videos, or of another count.
+    overwrite: replace frames of other videos, or of another count. A `count` of None then stands for its own number.
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Warns of captures that are too fast, too dark, not sharp or without parallax, and of videos that are cut off. Raises
@@ -103,7 +103,7 @@ def take_frames(
     wanted: list[dict[str, Any]] = [
         {"video": name, "sha256": _digest_of(path), "asked": count} for name, path in zip(names, videos, strict=True)
     ]
-    if (taken := _taken_before(output, wanted, overwrite=overwrite)) is not None:
+    if (taken := _taken_before(output, wanted, any_count=count is None, overwrite=overwrite)) is not None:
         progress("using the frames taken before", 1.0)
         return taken
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -174,10 +174,13 @@ def _from_table(folder: Path, table: dict[str, Any]) -> TakenFrames:
     return TakenFrames(folder, tuple(videos))
 
 
-def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool) -> TakenFrames | None:
+def _taken_before(
+    output: Path, wanted: list[dict[str, Any]], *, any_count: bool, overwrite: bool
+) -> TakenFrames | None:
     """Return the frames in the output if they are of the same videos and counts; None if frames have to be taken.
 
     wanted: name, SHA-256 and number of frames of each video, as in the table.
+    any_count: accept any number of frames of the same videos, unless `overwrite` is True.
     Raises InputError for an output with anything else, unless it holds frames and `overwrite` is True.
     """
     if not output.exists():
@@ -189,14 +192,17 @@ def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool
             raise InputError(f"{output}: is neither empty nor a folder of a video's frames, expected a new folder")
         return None
     table = _table(output)
-    keys = ("video", "sha256", "asked")
-    same = [{key: row.get(key) for key in keys} for row in table["videos"]] == wanted
+    keys = ("video", "sha256") if any_count and not overwrite else ("video", "sha256", "asked")
+    have, need = ([{key: row.get(key) for key in keys} for row in rows] for rows in (table["videos"], wanted))
+    same = have == need
     sizes = {frame["name"]: frame.get("bytes") for row in table["videos"] for frame in row["frames"]}
     changed = sorted(name for name, size in sizes.items() if _size(output / name) != size)
     if same and not changed and table.get("version") == FRAME_TABLE_VERSION:
         return _from_table(output, table)
     if not overwrite:
         why = "has frames of other videos, or another number of frames"
+        if not any_count:
+            why += " (without --frames, frames of the same videos are used as they are)"
         if same:
             why = (
                 f"{examples(changed)} were removed or changed" if changed else "was made by another version of clsplat"
