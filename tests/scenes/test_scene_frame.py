@@ -172,7 +172,7 @@ def test_a_reconstruction_is_turned_in_its_files_and_back(result: Path) -> None:
     assert scene.world_from_files is None
     model = pycolmap.Reconstruction(result / MODEL_FOLDER)
     model.update_point_3d_errors()
-    assert not list(result.glob(".frame-*"))
+    assert [path.name for path in (result / "sparse").iterdir()] == ["0"]
     again = set_frame(result, result / "images", UP, result)  # it is upright: nothing changes
     assert again.world_from_source.tolist() == frame.world_from_source.tolist()
     set_frame(result, result / "images", FrameUse("none"), result)

@@ -343,8 +343,9 @@ def task_of(monkeypatch):
         tasks.append(task)
         return {"result": {"registered": sorted(name for group in task["groups"] for name in group), "fragments": []}}
 
-    def move(work, output):
-        tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
+    def move(move):
+        photos = move[0].parent / "photos"
+        tasks.append({path.name: path.read_bytes() for path in photos.rglob("*") if path.is_file()})
 
     monkeypatch.setattr(sfm, "run_worker", run)
     monkeypatch.setattr(sfm, "turn_new", lambda *_: None)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import Capture, refuses, warnings_of
+from calls import Capture, raising, refuses, warnings_of
 from needs import require
 from pictures import write_pixels
 from tiny import write_scene
@@ -80,6 +80,35 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
     refuses("scene_frames: has frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
     sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
     assert len(tasks) == 2
+
+
+def test_what_is_replaced_stays_whole_until_the_new_scene_is_complete(
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "scene"
+    sfm.reconstruct(video, scene, frames=6)
+
+    def contents() -> dict[str, bytes]:
+        files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
+        return {path.relative_to(tmp_path).as_posix(): path.read_bytes() for path in files}
+
+    before, run_worker, move = contents(), sfm.run_worker, sfm.move_into_place
+    for trouble in (InputError("no cameras"), KeyboardInterrupt()):
+        monkeypatch.setattr(sfm, "run_worker", raising(trouble))
+        with pytest.raises(type(trouble)):
+            sfm.reconstruct(video, scene, frames=5, overwrite=True)
+        assert contents() == before
+    monkeypatch.setattr(sfm, "run_worker", run_worker)
+    # the scene cannot be renamed, as when another program has it open on Windows: the frames go back too
+    monkeypatch.setattr(sfm, "move_into_place", lambda frames, scene: move(frames, (tmp_path / "none", scene[1])))
+    with pytest.raises(FileNotFoundError):
+        sfm.reconstruct(video, scene, frames=5, overwrite=True)
+    assert contents() == before
+    monkeypatch.setattr(sfm, "move_into_place", move)
+    sfm.reconstruct(video, scene, frames=5, overwrite=True)
+    assert names_of(tasks[-1]) == frame_sequences(tmp_path / "scene_frames")[0]
+    assert 0 < len(names_of(tasks[-1])) <= 5
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene", "scene_frames"]
 
 
 def test_training_takes_the_frames_that_sfm_made(

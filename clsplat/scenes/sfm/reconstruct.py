@@ -8,13 +8,12 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 from clsplat.config.masks import MaskUse
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.atomic import move_into_place
+from clsplat.files.atomic import move_into_place, work_folder
 from clsplat.files.documents import is_file
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
@@ -137,35 +136,33 @@ def reconstruct(
     Warns of copies, of which one is used, of photographs without a pose, in an unreadable format or without their
     alpha, and of focal lengths that differ from EXIF's. Raises InputError for a folder without photographs, a
     photograph that does not decode, an output that must not be replaced, and if the cameras cannot be recovered.
-    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for all frames of videos.
+    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for all frames of videos. If
+    earlier frames are to be replaced, they and an earlier result stay whole until the new result is complete.
     """
     report = progress or no_progress
     settings.check()
-    videos = frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to)
-    paths, copies, left_out = _files(images, output, videos)
-    mask_files = _masks(images, paths, masks)
-    settings = _with_weights(settings)
-    asked = f"{settings}{_described(masks, mask_files)}{_identity(settings.weights)}{videos.fingerprint}"
-    fingerprint = sfm_photos.fingerprint(images, paths, asked)
-    if _is_finished(output, images, fingerprint, overwrite=overwrite):
-        report("using the cameras recovered before", 1.0)
-        set_frame(output, images, settings.frame, output)
-        return output
-    _require_enough(images, len(paths) + len(videos.paths))
-    _warn_of_left_out(images, left_out)
-    workers = threads or os.cpu_count() or 1
-    output.parent.mkdir(parents=True, exist_ok=True)
-    # Work in the output's parent folder, so that the last step is a rename within one file system.
-    with TemporaryDirectory(prefix=f".{output.name}-sfm-", dir=output.parent, ignore_cleanup_errors=True) as folder:
-        work = Path(folder)
-        photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
-        masked = _staged_masks(photos, mask_files, masks, work)
-        task = sfm_task(settings, photos, masked, videos.sequences, work, workers)
-        result = _recovered(images, len(photos), run_worker(task, work, report))
-        turn_new(work / "result", images, settings.frame, images)
-        _write_record(work / "result", fingerprint, photos, result)
-        _warn_of_losses(images, photos, result, work / "result" / "images", masks)
-        move_into_place(work, output)
+    with frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to) as videos:
+        paths, copies, left_out = _files(images, output, videos)
+        mask_files = _masks(images, paths, masks)
+        settings = _with_weights(settings)
+        asked = f"{settings}{_described(masks, mask_files)}{_identity(settings.weights)}{videos.fingerprint}"
+        fingerprint = sfm_photos.fingerprint(images, paths, asked)
+        if _is_finished(output, images, fingerprint, overwrite=overwrite):
+            report("using the cameras recovered before", 1.0)
+            set_frame(output, images, settings.frame, output)
+            return output
+        _require_enough(images, len(paths) + len(videos.paths))
+        _warn_of_left_out(images, left_out)
+        workers = threads or os.cpu_count() or 1
+        with work_folder(output) as work:
+            photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
+            masked = _staged_masks(photos, mask_files, masks, work)
+            task = sfm_task(settings, photos, masked, videos.sequences, work, workers)
+            result = _recovered(images, len(photos), run_worker(task, work, report))
+            turn_new(work / "result", images, settings.frame, images)
+            _write_record(work / "result", fingerprint, photos, result)
+            _warn_of_losses(images, photos, result, work / "result" / "images", masks)
+            move_into_place(*videos.moves, (work / "result", output))
     scale_new(output, images, settings.frame)
     return output
 

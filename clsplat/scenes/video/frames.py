@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import tempfile
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.atomic import atomic_write, move_into_place
+from clsplat.files.atomic import atomic_write, move_into_place, work_folder
 from clsplat.files.documents import is_file, known_digest
 from clsplat.images.writing import write_spec
 from clsplat.progress import Progress, no_progress
@@ -58,10 +57,14 @@ class FramesOfVideo:
 
 @dataclass(frozen=True)
 class TakenFrames:
-    """The folder of the frames, with FRAME_TABLE_FILE in it, and the frames of each video."""
+    """The folder of the frames, with FRAME_TABLE_FILE in it, and the frames of each video.
+
+    pending: True if the folder is hidden, as in `taking_frames`, and has yet to replace earlier frames.
+    """
 
     folder: Path
     videos: tuple[FramesOfVideo, ...]
+    pending: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -94,7 +97,27 @@ def take_frames(
 
     Warns of captures that are too fast, too dark, not sharp or without parallax, and of videos that are cut off. Raises
     InputError for a file that is not a video or shows nothing, and for an output that must not be replaced. After
-    KeyboardInterrupt no files remain.
+    KeyboardInterrupt no files remain, and frames that were to be replaced are whole.
+    """
+    with taking_frames(videos, output, root=root, count=count, overwrite=overwrite, progress=progress) as taken:
+        pass
+    return replace(taken, folder=output, pending=False)
+
+
+@contextmanager
+def taking_frames(
+    videos: Sequence[Path],
+    output: Path,
+    *,
+    root: Path | None,
+    count: int | None,
+    overwrite: bool,
+    progress: Progress,
+) -> Iterator[TakenFrames]:
+    """Context manager that takes frames like `take_frames`, and replaces earlier frames only at the end of the block.
+
+    Until then the new frames are in a hidden folder beside `output`. The block may call `move_into_place` for them
+    itself, together with its own result. If it raises an exception, also KeyboardInterrupt, earlier frames stay.
     """
     if count is not None and count < 1:
         raise InputError(f"{count} frames of a video were asked for, expected at least 1")
@@ -105,20 +128,23 @@ def take_frames(
     ]
     if (taken := _taken_before(output, wanted, any_count=count is None, overwrite=overwrite)) is not None:
         progress("using the frames taken before", 1.0)
-        return taken
-    output.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    try:
+        yield taken
+        return
+    with work_folder(output) as work:
+        made = work / "result"
         rows = [
-            {**row, **_frames_of(path, row["video"], work / "result", count, progress)}
+            {**row, **_frames_of(path, row["video"], made, count, progress)}
             for row, path in zip(wanted, videos, strict=True)
         ]
         table = {"version": FRAME_TABLE_VERSION, "videos": rows}
-        atomic_write(work / "result" / FRAME_TABLE_FILE, (json.dumps(table, indent=1) + "\n").encode())
-        move_into_place(work, output)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-    return _from_table(output, table)
+        atomic_write(made / FRAME_TABLE_FILE, (json.dumps(table, indent=1) + "\n").encode())
+        if is_file(output / FRAME_TABLE_FILE):
+            yield replace(_from_table(made, table), pending=True)
+            if made.exists():
+                move_into_place((made, output))
+            return
+        move_into_place((made, output))
+    yield _from_table(output, table)
 
 
 def frame_sequences(folder: Path) -> list[list[str]]:
