@@ -35,6 +35,8 @@ class SceneFrame:
     metres: True if world units are metres.
     origin: latitude and longitude in degrees and altitude in metres of the world's origin; () if unknown. If known,
         the world's x axis points east, and z north.
+    measured: the coordinates of two points that gave the scale, and the scale of world_from_source when they were
+        measured; () if no points gave it.
     up_note, scale_note: what the up direction and the unit come from, for the user; "" if neither was set.
     """
 
@@ -42,6 +44,7 @@ class SceneFrame:
     upright: bool = False
     metres: bool = False
     origin: tuple[float, ...] = ()
+    measured: tuple[float, ...] = ()
     up_note: str = ""
     scale_note: str = ""
 
@@ -69,6 +72,7 @@ class SceneFrame:
             "upright": self.upright,
             "metres": self.metres,
             "origin": list(self.origin),
+            "measured": list(self.measured),
             "up_note": self.up_note,
             "scale_note": self.scale_note,
         }
@@ -93,12 +97,16 @@ def read_frame(folder: Path) -> SceneFrame:
         matrix = np.array(document["world_from_source"], np.float64)
         decompose(matrix)
         upright, metres, origin = (document[key] for key in ("upright", "metres", "origin"))
+        measured = tuple(float(value) for value in document.get("measured", ()))  # records may be older
         notes = document["up_note"], document["scale_note"]
         assert isinstance(upright, bool)
         assert isinstance(metres, bool)
         assert len(origin) in (0, 3)
+        assert len(measured) in (0, 7)
+        assert all(abs(value) < np.inf for value in measured)
+        assert all(value > 0 for value in measured[6:])
         assert all(isinstance(note, str) for note in notes)
-        frame = SceneFrame(matrix, upright, metres, tuple(float(value) for value in origin), *notes)
+        frame = SceneFrame(matrix, upright, metres, tuple(float(value) for value in origin), measured, *notes)
     except (ValueError, KeyError, TypeError, AssertionError, InputError) as error:
         raise InputError(
             f"{path}: is damaged ({str(error) or 'its form is wrong'}), expected {_EXPECTED_FRAME_RECORD}; make the "
