@@ -113,9 +113,11 @@ def test_the_same_bytes_twice_and_an_existing_result(video: Path, tmp_path: Path
     )
     assert frame_sequences(tmp_path / "a") == [[name for name in first.names if name != first.names[2]]]
     assert len(take_frames([video], tmp_path / "a", count=4, overwrite=True).names) == 4
-    own = len(take_frames([video], tmp_path / "a", overwrite=True).names)  # by length and motion
-    assert own != 4
-    assert table_of(tmp_path / "a")["videos"][0]["asked"] is None
+    assert len(take_frames([video], tmp_path / "a", overwrite=True).names) == 4  # no number is asked for
+    mask = Path(shutil.copy(tmp_path / "a" / first.names[0], tmp_path / "a" / "mask.jpg"))
+    told = r"a: has pictures beside its frames \(mask\.jpg\), which would be removed"
+    refuses(told, take_frames, [video], tmp_path / "a", count=6, overwrite=True)
+    mask.unlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "walk.mp4"]
 
 

@@ -19,6 +19,7 @@ from tiny import write_scene
 from walk_videos import sliding, walk, write_walk
 
 from clsplat.cli.main import main
+from clsplat.config.masks import MaskUse
 from clsplat.errors import InputError
 from clsplat.scenes import loading
 from clsplat.scenes.folder_layouts import detect
@@ -80,6 +81,35 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
     refuses("scene_frames: has frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
     sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
     assert len(tasks) == 2
+
+
+def test_masks_of_frames(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    """Masks are found beside the frames whether the video, the folder of its frames, or the video's folder is given."""
+    scene, frames = tmp_path / "scene", tmp_path / "scene_frames"
+    sfm.reconstruct(video, scene, frames=6)
+    use = MaskUse("ignore")
+    told = (
+        r"walk\.mp4: has no masks, expected masks/walk\.mp4/\d+\.jpg\.png in .*scene_frames, its folder of frames, or"
+    )
+    refuses(told, sfm.reconstruct, video, scene, masks=use, overwrite=True)
+    masked = names_of(tasks[0])[1:]
+    for name in masked:
+        write_pixels(frames / "masks" / f"{name}.png", np.full((72, 96, 3), 255, np.uint8))
+    sfm.reconstruct(frames, tmp_path / "other", masks=use)
+    sfm.reconstruct(video, scene, masks=use, overwrite=True)
+    assert [sorted(task["masks"]) for task in tasks[1:]] == [masked, masked]
+    refuses("scene_frames: has pictures beside its frames", sfm.reconstruct, video, scene, frames=5, overwrite=True)
+
+    folder = tmp_path / "shot"
+    folder.mkdir()
+    shutil.copy(video, folder / "walk.mp4")
+    for index in (10, 14, 18):
+        write_pixels(folder / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
+    sfm.reconstruct(folder, tmp_path / "mixed", frames=6)
+    shutil.copytree(frames / "masks", tmp_path / "masks")  # beside both folders
+    write_pixels(tmp_path / "masks" / "14.png", np.full((72, 96, 3), 255, np.uint8))
+    sfm.reconstruct(folder, tmp_path / "mixed", masks=use, overwrite=True)
+    assert sorted(tasks[-1]["masks"]) == ["14.png", *masked]
 
 
 def test_what_is_replaced_stays_whole_until_the_new_scene_is_complete(

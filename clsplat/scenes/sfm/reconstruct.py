@@ -143,7 +143,7 @@ def reconstruct(
     settings.check()
     with frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to) as videos:
         paths, copies, left_out = _files(images, output, videos)
-        mask_files = _masks(images, paths, masks)
+        mask_files = _masks(images, paths, masks, videos)
         settings = _with_weights(settings)
         asked = f"{settings}{_described(masks, mask_files)}{_identity(settings.weights)}{videos.fingerprint}"
         fingerprint = sfm_photos.fingerprint(images, paths, asked)
@@ -346,19 +346,24 @@ def _require_enough(images: Path, count: int) -> None:
         raise InputError(f"{images}: only {count} photo(s) found, expected at least {MIN_SFM_PHOTOS}")
 
 
-def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
-    """Find the masks of the photographs, by the photographs' names.
+def _masks(images: Path, paths: list[Path], use: MaskUse | None, videos: VideoFrames) -> dict[str, Path]:
+    """Find the masks of the photographs and of the videos' frames, by the photographs' and frames' names.
 
-    Raises InputError if masks are requested but missing, or if a mask fits no photograph.
+    Raises InputError if masks are requested but missing. Also raises it if a mask fits no photograph or frame, unless
+    there are both, whose masks may be in one folder.
     """
     if use is None or use.masks == "none":
         return {}
     photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
-    found = masks_beside(photos, others=OTHER_MASK_FOLDERS)
+    frames = [_FoundPhoto(name, videos.folder / name) for name in videos.names]
+    found: dict[str, Path] = {}
+    for pictures in (photos, frames):
+        if pictures:
+            found |= masks_beside(pictures, strict=not (photos and frames), others=OTHER_MASK_FOLDERS)
     if not found:
-        raise InputError(
-            f"{images}: has no masks, expected masks/IMAGE.jpg.png next to the photos' folder or inside it"
-        )
+        where = f"{videos.folder}, its folder of frames," if frames else "the photos' folder"
+        name = frames[0].name if frames else "IMAGE.jpg"
+        raise InputError(f"{images}: has no masks, expected masks/{name}.png in {where} or next to it")
     warn_of_sense(found.values(), use, images)
     return found
 

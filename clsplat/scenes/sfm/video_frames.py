@@ -70,6 +70,11 @@ class VideoFrames:
         return digest((self.made or self.folder) / FRAME_TABLE_FILE) if self.paths else ""
 
     @property
+    def names(self) -> list[str]:
+        """Names of the videos' frames: their paths below the folder of the frames."""
+        return [photo_name(self.made or self.folder, path) for path in self.paths]
+
+    @property
     def moves(self) -> list[tuple[Path, Path]]:
         """The move of new frames in place of earlier ones, for `move_into_place`; empty if there is none."""
         return [] if self.made is None else [(self.made, self.folder)]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import atomic_write, move_into_place, work_folder
 from clsplat.files.documents import is_file, known_digest
+from clsplat.images.reading import find_images
 from clsplat.images.writing import write_spec
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
@@ -92,7 +93,7 @@ def take_frames(
 
     root: folder below which the videos are named; by default the first video's folder.
     count: number of frames of each video; None for a number by the video's length and motion.
-    overwrite: replace frames of other videos, or of another count. A `count` of None then stands for its own number.
+    overwrite: replace frames of other videos, or of another count.
     progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Warns of captures that are too fast, too dark, not sharp or without parallax, and of videos that are cut off. Raises
@@ -206,7 +207,7 @@ def _taken_before(
     """Return the frames in the output if they are of the same videos and counts; None if frames have to be taken.
 
     wanted: name, SHA-256 and number of frames of each video, as in the table.
-    any_count: accept any number of frames of the same videos, unless `overwrite` is True.
+    any_count: accept any number of frames of the same videos.
     Raises InputError for an output with anything else, unless it holds frames and `overwrite` is True.
     """
     if not output.exists():
@@ -218,7 +219,7 @@ def _taken_before(
             raise InputError(f"{output}: is neither empty nor a folder of a video's frames, expected a new folder")
         return None
     table = _table(output)
-    keys = ("video", "sha256") if any_count and not overwrite else ("video", "sha256", "asked")
+    keys = ("video", "sha256") if any_count else ("video", "sha256", "asked")
     have, need = ([{key: row.get(key) for key in keys} for row in rows] for rows in (table["videos"], wanted))
     same = have == need
     sizes = {frame["name"]: frame.get("bytes") for row in table["videos"] for frame in row["frames"]}
@@ -236,6 +237,12 @@ def _taken_before(
         raise InputError(
             f"{output}: {why}; give this folder in place of the video, remove it, or give --overwrite to clsplat sfm "
             "or capture"
+        )
+    taken = {output / name for name in sizes}
+    if others := [path.relative_to(output).as_posix() for path in find_images(output) if path not in taken]:
+        raise InputError(
+            f"{output}: has pictures beside its frames ({examples(others)}), which would be removed; move them to "
+            "another folder to replace the frames"
         )
     return None
 
