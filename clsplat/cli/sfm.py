@@ -80,8 +80,9 @@ def run(verb: SfmVerb, services: Services) -> int:
     if verb.invert_masks and not verb.masks:
         raise InputError("--invert-masks: no masks are used without --masks, expected both flags")
     from clsplat.scenes.orientation.frame_record import read_frame
+    from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
     from clsplat.scenes.sfm.framing import MODEL_FOLDER
-    from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
+    from clsplat.scenes.sfm.reconstruct import SfmSettings
 
     frame = FrameUse(verb.orient, verb.scale)
     settings = SfmSettings(

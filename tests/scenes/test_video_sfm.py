@@ -24,6 +24,7 @@ from clsplat.errors import InputError
 from clsplat.scenes import loading
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.sfm import reconstruct as sfm
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
 from clsplat.scenes.sfm.video_frames import find_videos, frames_folder, reconstruction_folder
 from clsplat.scenes.video.frames import frame_sequences, take_frames
 
@@ -81,6 +82,38 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
     refuses("scene_frames: has frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
     sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
     assert len(tasks) == 2
+
+
+def test_folders_that_clsplat_made_are_left_out(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    """NAME_frames and NAME_colmap beside the videos of a folder, which are known by their records, not their names."""
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    one = Path(shutil.copy(video, folder / "one.mp4"))
+    sfm.reconstruct(one, folder / "one_colmap", frames=6)
+    two = Path(shutil.copy(video, folder / "two.mp4"))
+    (folder / "one_colmap").rename(folder / "scene")
+    kept = folder / "kept_frames" / "7.png"  # has a table and a record of other programs
+    write_pixels(kept, np.rint(255 * FRAMES[7]).astype(np.uint8))
+    (kept.parent / "frames.json").write_text('{"frames": []}')
+    (kept.parent / SFM_RECORD_FILE).write_text("[]")
+    messages = warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "all", frames=4))
+    assert {name.rpartition("/")[0] for name in names_of(tasks[-1])} == {"kept_frames", "one.mp4", "two.mp4"}
+    told = (
+        "shots: 2 folder(s) (one_frames, scene) left out: made by clsplat from a video or photos; to use such pictures"
+    )
+    assert len([text for text in messages if told in text]) == 1
+    # each of them can be given itself
+    sfm.reconstruct(folder / "one_frames", tmp_path / "frames")
+    assert len(names_of(tasks[-1])) == len(names_of(tasks[0]))
+    one.unlink()
+    two.unlink()
+    kept.unlink()
+    refuses(
+        "shots: no photos found, only in one_frames, scene, made by clsplat",
+        sfm.reconstruct,
+        folder,
+        tmp_path / "x",
+    )
 
 
 def test_masks_of_frames(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
@@ -300,6 +333,6 @@ def test_the_command_line_refuses_what_is_no_video(
 def test_cameras_of_a_video(tmp_path: Path) -> None:
     video = write_walk(tmp_path / "walk.mp4", walk(320, 240, 40, sub_frames=1).frames)
     scene = sfm.reconstruct(video, tmp_path / "scene", sfm.SfmSettings(camera_model="SIMPLE_PINHOLE"))
-    record = json.loads((scene / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((scene / SFM_RECORD_FILE).read_text())
     assert record["photos"] >= 10
     assert len(record["registered"]) >= 0.8 * record["photos"]

@@ -21,6 +21,7 @@ from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
 from clsplat.scenes.sfm.framing import scale_new, set_frame, turn_new
 from clsplat.scenes.sfm.pipeline.photo_pairs import SFM_MATCHINGS
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
@@ -33,8 +34,6 @@ Mapper = Literal["auto", "global", "incremental"]
 Features = Literal["sift", "aliked"]
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"]
 
-SFM_RECORD_FILE = "sfm.json"
-"""File in the result that records its photographs and settings, the photographs without a pose, and its quality."""
 MIN_SFM_PHOTOS = 3
 """Minimum number of photographs of a reconstruction."""
 SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
@@ -177,10 +176,10 @@ def _files(
 
 
 def _warn_of_left_out(images: Path, left_out: dict[str, list[Path]]) -> None:
-    """Warn of photographs and videos that are left out. left_out: lists of files, keyed by the reason."""
+    """Warn of photographs, videos and folders that are left out. left_out: lists of files, keyed by the reason."""
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
-        kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
+        kind = "folder(s)" if others[0].is_dir() else "video(s)" if all(map(is_video_name, others)) else "photo(s)"
         warn(f"{images}: {_listed(names, kind)} left out: {why}")
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -11,9 +10,9 @@ from pathlib import Path
 
 from clsplat.errors import InputError
 from clsplat.files.documents import digest
-from clsplat.images.reading import cannot_be_searched
 from clsplat.images.video import video_missing
 from clsplat.progress import Progress
+from clsplat.scenes.sfm.captured_files import captured_files
 from clsplat.scenes.sfm.photos import (
     CONVERTED_PHOTO_EXTENSIONS,
     SFM_PHOTO_EXTENSIONS,
@@ -154,18 +153,15 @@ def find_videos(folder: Path, excluded: Collection[Path] = ()) -> tuple[list[Pat
     """Return the videos below a folder, sorted by name, and the videos that are left out, keyed by the reason.
 
     A video with the name of a photograph in the same folder is left out, as phones write such videos with their moving
-    photographs. Hidden files and folders, and the folders `excluded`, are skipped.
+    photographs. The search is that of `captured_files`, which skips the folders `excluded`.
     """
-    skip = {path.resolve() for path in excluded}
     videos: list[Path] = []
     moving: list[Path] = []
-    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
-        here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
+    for here, files in captured_files(folder, excluded).folders:
         kinds = SFM_PHOTO_EXTENSIONS | CONVERTED_PHOTO_EXTENSIONS | UNREADABLE_PHOTO_EXTENSIONS
         stills = {Path(name).stem.casefold() for name in files if Path(name).suffix.lower() in kinds}
         for name in files:
-            if not name.startswith(".") and is_video_name(Path(name)):
+            if is_video_name(Path(name)):
                 if not name.isprintable():
                     raise InputError(f"{here / name}: its name has unprintable characters; rename it")
                 (moving if Path(name).stem.casefold() in stills else videos).append(here / name)
