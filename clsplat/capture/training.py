@@ -13,6 +13,7 @@ from typing import Any
 from clsplat.api import train
 from clsplat.capture.progress import CaptureProgress
 from clsplat.config.presets import scheduled
+from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError, warn
@@ -95,12 +96,7 @@ def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: Cap
     """
     scene = load_scene(
         folder,
-        resolution=config.resolution,
-        test_every=config.test_every,
-        test_most=config.test_most,
-        masks=config.mask_use,
-        lenses=config.lenses,
-        missing=config.missing,
+        **scene_arguments(config),
         progress=progress,
         frame=config.frame_use if earlier is None else earlier.frame_to_resume(),
     )

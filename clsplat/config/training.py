@@ -459,11 +459,6 @@ class TrainConfig:
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property
-    def test_views(self) -> tuple[int, int]:
-        """The settings (test_every, test_most), by which views are held out."""
-        return self.test_every, self.test_most
-
-    @property
     def depth_use(self) -> DepthUse:
         """Source of the known depths to compare with the render, and the units of depth maps."""
         return DepthUse(self.depth, self.depth_maps, self.depth_unit) if self.depth != "none" else DepthUse()

@@ -18,6 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.arrays import Float32
+from clsplat.config.scene_arguments import scene_arguments
 from clsplat.errors import InputError
 from clsplat.evaluation.held_out import picture_names
 from clsplat.images.alpha import composite
@@ -77,22 +78,14 @@ def scene_of(run: Run) -> Scene | str:
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
-    masks = run.config.mask_use
+    arguments = scene_arguments(run.config)
     try:
         if detect(source) == "photos":
             source = reconstruction_folder(source.resolve())
             if not source.is_dir():
                 return "the scene is a folder of photos or a video, and its reconstruction no longer exists"
-            masks = after_sfm(masks, source)
-        return load_scene(
-            source,
-            resolution=run.config.resolution,
-            test_every=run.config.test_every,
-            test_most=run.config.test_most,
-            masks=masks,
-            lenses=run.config.lenses,
-            missing=run.config.missing,
-        )
+            arguments["masks"] = after_sfm(arguments["masks"], source)
+        return load_scene(source, **arguments)
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"
 
