@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config.masks import NO_MASKS, MaskUse
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import is_model_name
@@ -81,7 +80,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         masks = config.mask_use
-        scene = load_scene(run.scene, **scene_arguments(config), progress=progress)
+        scene = load_scene(run.scene, **config.scene_arguments(), progress=progress)
     else:
         scene, masks = load_scene(path, progress=progress), NO_MASKS
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))

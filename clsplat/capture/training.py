@@ -13,7 +13,6 @@ from typing import Any
 from clsplat.api import train
 from clsplat.capture.progress import CaptureProgress
 from clsplat.config.presets import scheduled
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError, warn
@@ -96,7 +95,7 @@ def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: Cap
     """
     scene = load_scene(
         folder,
-        **scene_arguments(config),
+        **config.scene_arguments(),
         progress=progress,
         frame=config.frame_use if earlier is None else earlier.frame_to_resume(),
     )

@@ -19,7 +19,6 @@ from clsplat.config.checks import Rule, check_rules
 from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.orientation import AS_IN_FILES
-from clsplat.config.scene_arguments import SceneArguments, scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import check_new
@@ -432,7 +431,7 @@ def _measured(
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
     config = TrainConfig(resolution=verb.resolution, test_every=verb.test_every, missing="skip")
-    arguments: SceneArguments = {**scene_arguments(config), "masks": masks}
+    arguments = {**config.scene_arguments(), "masks": masks}
     frame = AS_IN_FILES if run is None else run.frame_for(verb.scene)
     scene = load_scene(services, verb.scene, arguments, frame)
     renderer = services.renderer(services.require(device, FORWARD_STAGES))

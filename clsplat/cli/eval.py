@@ -14,7 +14,6 @@ from tyro.conf import arg
 from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.orientation import AS_IN_FILES
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import Missing, TrainConfig
 from clsplat.errors import CapacityError, InputError, warn
 
@@ -142,7 +141,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     flags = {name: getattr(verb, name) for name in ("resolution", "test_every", "test_most", "missing")}
     config = replace(config, **{name: value for name, value in flags.items() if value is not None})
     frame = AS_IN_FILES if trained is None else trained.frame_for(source)
-    scene = load_scene(services, source, scene_arguments(config), frame)
+    scene = load_scene(services, source, config.scene_arguments(), frame)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {config.test_every}, expected at least one")

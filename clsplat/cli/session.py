@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +14,6 @@ from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
-    from clsplat.config.scene_arguments import SceneArguments
     from clsplat.device.context import Device
     from clsplat.device.selection import DeviceInfo
     from clsplat.evaluation.held_out import Evaluation
@@ -60,13 +59,13 @@ class Services:
 def load_scene(
     services: Services,
     path: Path,
-    arguments: SceneArguments,
+    arguments: Mapping[str, Any],
     frame: FrameUse | SceneFrame = AS_IN_FILES,
     frames: int | None = None,
 ) -> Scene:
     """Load the scene in the folder `path`, print its warnings, and return it.
 
-    arguments: arguments of `clsplat.load_scene`, as from `scene_arguments`. frame, frames: as for `clsplat.load_scene`.
+    arguments: arguments of `clsplat.load_scene`, from `TrainConfig.scene_arguments`. frame, frames: as for it too.
     """
     scene = services.load_scene(path, **arguments, progress=StageProgress(), frame=frame, frames=frames)
     for text in scene.warnings:

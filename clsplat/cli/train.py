@@ -19,7 +19,6 @@ from clsplat.cli.options import Flag, Memory, OptionalInt, Output, PageOptions, 
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import parse_bytes
 from clsplat.config.presets import Preset, Schedule, bundled, by_passes, steps_made_for
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import open_input
@@ -329,7 +328,7 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
     scene = load_scene(
         services,
         source,
-        scene_arguments(config),
+        config.scene_arguments(),
         config.frame_use if earlier is None else earlier.frame_to_resume(),
         frames,
     )

@@ -17,7 +17,6 @@ from tyro.conf import arg
 from clsplat.cli.options import DeviceOptions, PageOptions, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services
 from clsplat.config.orientation import AS_IN_FILES
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, endings, handled
@@ -145,7 +144,7 @@ def _scene(services: Services, path: Path | None, run: Run | None, *, given: boo
     config = run.config if run else TrainConfig()
     frame = AS_IN_FILES if run is None else run.frame_for(path)
     try:
-        return services.load_scene(path, **scene_arguments(config), frame=frame)
+        return services.load_scene(path, **config.scene_arguments(), frame=frame)
     except (InputError, OSError) as error:
         if given:
             raise

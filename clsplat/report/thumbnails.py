@@ -18,7 +18,6 @@ import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.errors import InputError
 from clsplat.evaluation.held_out import picture_names
 from clsplat.images.alpha import composite
@@ -78,7 +77,7 @@ def scene_of(run: Run) -> Scene | str:
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
-    arguments = scene_arguments(run.config)
+    arguments = run.config.scene_arguments()
     try:
         if detect(source) == "photos":
             source = reconstruction_folder(source.resolve())

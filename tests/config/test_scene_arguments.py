@@ -7,20 +7,19 @@ import inspect
 from pathlib import Path
 
 from clsplat.config.masks import MaskUse
-from clsplat.config.scene_arguments import scene_arguments
 from clsplat.config.training import TrainConfig
 from clsplat.scenes.loading import load_scene
 
 
 def test_they_have_the_names_and_defaults_of_load_scene() -> None:
     parameters = inspect.signature(load_scene).parameters
-    assert dict(scene_arguments(TrainConfig())) == {
-        name: parameters[name].default for name in scene_arguments(TrainConfig())
+    assert TrainConfig().scene_arguments() == {
+        name: parameters[name].default for name in TrainConfig().scene_arguments()
     }
     settings = TrainConfig(
         resolution=3, test_every=4, test_most=5, masks="ignore", invert_masks=True, lenses="native", missing="skip"
     )
-    assert scene_arguments(settings) == {
+    assert settings.scene_arguments() == {
         "resolution": 3,
         "test_every": 4,
         "test_most": 5,
