@@ -2,6 +2,7 @@
 """Reading of images with OpenImageIO, resampling, and the search for images in folders.
 
 In memory an image is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), in the file's own colour space; nothing is linearised.
+Only photographs in Display P3 and Adobe RGB are converted, to sRGB.
 Alpha in memory is always straight (unassociated). In files it is straight in PNG, premultiplied (associated) in EXR.
 """
 
@@ -23,6 +24,7 @@ from clsplat.errors import InputError, examples, reason_of
 from clsplat.files.documents import is_file, open_input
 from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
+from clsplat.images.decoders.colour_profiles import in_srgb
 from clsplat.images.decoders.orientation import turned
 from clsplat.images.decoders.photo_decoders import (
     DECODED_PHOTO_EXTENSIONS,
@@ -260,6 +262,7 @@ def open_image(path: Path) -> Any:
     """Open an image and check its header. Returns OpenImageIO's input, which does not premultiply straight alpha.
 
     HEIF, AVIF and raw photographs, which OpenImageIO does not decode, give a `DecodedPhoto` with the same methods.
+    Photographs with an ICC profile of Display P3 or Adobe RGB give an `SrgbPhoto`, which converts their colours.
 
     Raises InputError if the file is missing, not an image, or has an implausible size.
     """
@@ -285,7 +288,7 @@ def open_image(path: Path) -> Any:
             f"{path}: its header gives {spec.width} x {spec.height} pixels of {spec.nchannels} channels and a display "
             f"window of {spec.full_width} x {spec.full_height}, too many for a file of {size} bytes; is it damaged?"
         )
-    return source
+    return in_srgb(source)
 
 
 def _opened_by_oiio(path: Path, head: bytes) -> Any:

@@ -21,6 +21,7 @@ from clsplat.errors import ClsplatError, InputError, examples
 from clsplat.files.atomic import require_room, room_error, write_error
 from clsplat.files.documents import is_file
 from clsplat.files.names import ON_WINDOWS, native_name
+from clsplat.images.decoders.colour_profiles import SrgbPhoto
 from clsplat.images.decoders.decoded_photo import PHOTOS_EXTRA
 from clsplat.images.decoders.orientation import turned
 from clsplat.images.decoders.photo_decoders import (
@@ -157,10 +158,11 @@ def stage_photos(
 ) -> list[Photo]:
     """Put a copy of every photograph, or a link to it, under `target`, and decode it once. Returns the photographs.
 
-    pycolmap ignores the EXIF orientation and cannot read some formats. So photographs with an orientation, or in such a
-    format, are rewritten upright, with the EXIF data from which pycolmap takes focal lengths and GPS positions. Other
-    files are linked, or copied if the file system has no links. Raises InputError that names the first photograph that
-    does not decode, as pycolmap would silently skip it.
+    pycolmap ignores the EXIF orientation and ICC profiles, and cannot read some formats. So photographs with an
+    orientation, in Display P3 or Adobe RGB, or in such a format, are rewritten upright and in sRGB. The copies have the
+    EXIF data from which pycolmap takes focal lengths and GPS positions. Other files are linked, or copied if the file
+    system has no links. Raises InputError that names the first photograph that does not decode, as pycolmap would
+    silently skip it.
 
     report: function that is called with the fraction of the photographs that are done.
     """
@@ -200,10 +202,11 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
     copy.parent.mkdir(parents=True, exist_ok=True)
     orientation = spec.get_int_attribute("Orientation", 1)
     width, height = spec.width, spec.height
-    if orientation in range(2, 9) or kind not in SFM_IMAGE_FORMATS:
+    decoded = kind in PHOTO_DECODERS or isinstance(source, SrgbPhoto)
+    if orientation in range(2, 9) or kind not in SFM_IMAGE_FORMATS or decoded:
         if orientation in range(5, 9):
             width, height = height, width
-        _write_upright(path, copy, spec, pixels if kind in PHOTO_DECODERS else None)
+        _write_upright(path, copy, spec, pixels if decoded else None)
     else:
         try:
             if ON_WINDOWS and not os.access(path, os.W_OK):
