@@ -80,16 +80,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         masks = config.mask_use
-        scene = load_scene(
-            run.scene,
-            resolution=config.resolution,
-            test_every=config.test_every,
-            test_most=config.test_most,
-            lenses=config.lenses,
-            missing=config.missing,
-            masks=masks,
-            progress=progress,
-        )
+        scene = load_scene(run.scene, **config.scene_arguments(), progress=progress)
     else:
         scene, masks = load_scene(path, progress=progress), NO_MASKS
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))

@@ -32,7 +32,8 @@ from clsplat.runs.run import Run
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.level import COLMAP_UP
-from clsplat.scenes.sfm.reconstruct import DEFAULT_SFM_SETTINGS, SFM_RECORD_FILE, SfmSettings, reconstruct
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
+from clsplat.scenes.sfm.reconstruct import DEFAULT_SFM_SETTINGS, SfmSettings, reconstruct
 
 ASSUMED_PHOTOGRAPHS = 100
 """Number of photographs that the estimate of the remaining time assumes until their number is known."""

@@ -86,7 +86,8 @@ def photographs_of(
         taken = take_frames(videos, folder.frames, root=root, count=frames, progress=progress)
         return PhotographSource(folder.frames, len(taken.names))
     (source,) = sources
-    found = frames_of_videos(source, folder.scene, frames, progress, folder=folder.frames)
+    with frames_of_videos(source, folder.scene, frames, progress, folder=folder.frames) as found:
+        pass
     count = len(find_images(source)) + len(found.paths)
     if not found.paths:
         progress("using the photographs where they are", 1.0)

@@ -95,12 +95,7 @@ def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: Cap
     """
     scene = load_scene(
         folder,
-        resolution=config.resolution,
-        test_every=config.test_every,
-        test_most=config.test_most,
-        masks=config.mask_use,
-        lenses=config.lenses,
-        missing=config.missing,
+        **config.scene_arguments(),
         progress=progress,
         frame=config.frame_use if earlier is None else earlier.frame_to_resume(),
     )

@@ -16,9 +16,10 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import Rule, check_rules
-from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
+from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.orientation import AS_IN_FILES
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import check_new
 from clsplat.files.documents import is_file, read_document
@@ -429,9 +430,10 @@ def _measured(
     run = run_of(verb.source)
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
+    config = TrainConfig(resolution=verb.resolution, test_every=verb.test_every, missing="skip")
+    arguments = {**config.scene_arguments(), "masks": masks}
     frame = AS_IN_FILES if run is None else run.frame_for(verb.scene)
-    split = (verb.test_every, TEST_MOST)
-    scene = load_scene(services, verb.scene, verb.resolution, split, masks, missing="skip", frame=frame)
+    scene = load_scene(services, verb.scene, arguments, frame)
     renderer = services.renderer(services.require(device, FORWARD_STAGES))
     background = background_colour(verb.background)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
@@ -138,16 +138,13 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     from clsplat.runs.refined_lenses import through_refined
 
     config = trained.config if trained else TrainConfig()
-    resolution = config.resolution if verb.resolution is None else verb.resolution
-    test_every = config.test_every if verb.test_every is None else verb.test_every
-    test_most = config.test_most if verb.test_most is None else verb.test_most
-    missing = verb.missing or config.missing
+    flags = {name: getattr(verb, name) for name in ("resolution", "test_every", "test_most", "missing")}
+    config = replace(config, **{name: value for name, value in flags.items() if value is not None})
     frame = AS_IN_FILES if trained is None else trained.frame_for(source)
-    split = (test_every, test_most)
-    scene = load_scene(services, source, resolution, split, config.mask_use, config.lenses, missing, frame)
+    scene = load_scene(services, source, config.scene_arguments(), frame)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
-        raise InputError(f"{source}: no view is held out with --test-every {test_every}, expected at least one")
+        raise InputError(f"{source}: no view is held out with --test-every {config.test_every}, expected at least one")
     return scene, views
 
 

@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
-    from clsplat.config.training import Lenses, Missing
     from clsplat.device.context import Device
     from clsplat.device.selection import DeviceInfo
     from clsplat.evaluation.held_out import Evaluation
@@ -61,29 +59,15 @@ class Services:
 def load_scene(
     services: Services,
     path: Path,
-    resolution: int,
-    test_views: tuple[int, int],
-    masks: MaskUse = NO_MASKS,
-    lenses: Lenses = "undistort",
-    missing: Missing = "few",
+    arguments: Mapping[str, Any],
     frame: FrameUse | SceneFrame = AS_IN_FILES,
+    frames: int | None = None,
 ) -> Scene:
     """Load the scene in the folder `path`, print its warnings, and return it.
 
-    test_views: (test_every, test_most), which choose the held-out views.
-    Other arguments: as for `clsplat.load_scene`.
+    arguments: arguments of `clsplat.load_scene`, from `TrainConfig.scene_arguments`. frame, frames: as for it too.
     """
-    scene = services.load_scene(
-        path,
-        resolution=resolution,
-        test_every=test_views[0],
-        test_most=test_views[1],
-        masks=masks,
-        lenses=lenses,
-        missing=missing,
-        progress=StageProgress(),
-        frame=frame,
-    )
+    scene = services.load_scene(path, **arguments, progress=StageProgress(), frame=frame, frames=frames)
     for text in scene.warnings:
         warn(text)
     return scene

@@ -29,8 +29,8 @@ class SfmVerb(Verb):
     output: Output
     """Folder for the scene. The frames of videos are written to a folder beside it, NAME_frames."""
     frames: OptionalInt = None
-    """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: by
-    length and motion, at most 300."""
+    """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: frames
+    that were taken before, of any number, else by length and motion, at most 300."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
     """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed."""
     features: Literal["sift", "aliked"] = "sift"
@@ -80,8 +80,9 @@ def run(verb: SfmVerb, services: Services) -> int:
     if verb.invert_masks and not verb.masks:
         raise InputError("--invert-masks: no masks are used without --masks, expected both flags")
     from clsplat.scenes.orientation.frame_record import read_frame
+    from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
     from clsplat.scenes.sfm.framing import MODEL_FOLDER
-    from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
+    from clsplat.scenes.sfm.reconstruct import SfmSettings
 
     frame = FrameUse(verb.orient, verb.scale)
     settings = SfmSettings(

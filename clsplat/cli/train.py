@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, Suppress, arg
 
 from clsplat.cli.eval import print_summary, tell_of_lpips
-from clsplat.cli.options import Flag, Memory, Output, PageOptions, SeveralDevices, Verb, with_given
+from clsplat.cli.options import Flag, Memory, OptionalInt, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import parse_bytes
 from clsplat.config.presets import Preset, Schedule, bundled, by_passes, steps_made_for
@@ -45,6 +45,9 @@ class TrainVerb(Verb):
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
     """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos, videos or both; or a video. Not
     needed with --resume."""
+    frames: OptionalInt = None
+    """Number of frames to take from each video, as with clsplat sfm --frames. If not given: frames that were taken
+    before, of any number, else a number by length and motion."""
     resume: Flag = False
     """Continue the run in the output folder."""
     accept_changes: Flag = False
@@ -164,6 +167,8 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     parse_bytes(verb.max_host_mem, "--max-host-mem")
     verb.config.check()
     _check_used(verb.config, verb.given)
+    if verb.frames is not None and verb.frames < 1:
+        raise InputError(f"--frames {verb.frames}: expected at least 1")
     page = None
     if verb.view:
         from clsplat.cli.view import training_view
@@ -291,7 +296,7 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
     from clsplat.scenes.analysis.recommendations import answered, paragraph
 
     config = verb.config
-    scene = _scene(services, source, config, earlier)
+    scene = _scene(services, source, config, earlier, verb.frames)
     if earlier is not None:
         return scene, config
     photographs = len(scene.train_views)
@@ -304,15 +309,16 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
     if not verb.auto:
         return scene, config
     if (better.mask_use, better.lenses) != (config.mask_use, config.lenses):
-        scene = _scene(services, source, better)
+        scene = _scene(services, source, better, None, verb.frames)
     return scene, better
 
 
-def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None = None) -> Scene:
+def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None, frames: int | None) -> Scene:
     """Load the training scene with its initial points. Raises InputError if training on it would fail.
 
-    source: the scene's folder.
+    source: the scene's folder, or a video.
     earlier: the run to continue; None for a new run.
+    frames: number of frames of each video; None for frames that were taken before, or a number by the video.
     """
     from clsplat.training.preparation import prepared
 
@@ -322,12 +328,9 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
     scene = load_scene(
         services,
         source,
-        config.resolution,
-        config.test_views,
-        config.mask_use,
-        config.lenses,
-        config.missing,
+        config.scene_arguments(),
         config.frame_use if earlier is None else earlier.frame_to_resume(),
+        frames,
     )
     scene = prepared(scene, config, earlier)
     _check_scene(scene)

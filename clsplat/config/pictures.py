@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 Filter = Literal["box", "blackman-harris"]
 Depths = Literal["z", "inverse", "ray"]
 
+VIDEO_SUFFIXES = (".mp4", ".mov")
+"""Lower-case extensions of the videos that frames are written to."""
 STRIP_PIXELS = 1 << 24
 """Maximum number of pixels in a strip of a picture, before --supersample's filter. With every channel, a strip takes
 about a gigabyte."""

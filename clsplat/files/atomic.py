@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic writes of files by temporary files and renames, checks of disk space, and errors about full disks."""
+"""Atomic writes of files and folders by temporary ones and renames, checks of disk space, errors about full disks."""
 
 from __future__ import annotations
 
@@ -243,19 +243,40 @@ def replace(source: Path, target: Path) -> None:
     _retry_on_windows(lambda: source.replace(target))
 
 
-def move_into_place(work: Path, output: Path) -> None:
-    """Move the finished folder `work`/result to `output`, in place of an earlier folder.
+@contextmanager
+def work_folder(output: Path) -> Iterator[Path]:
+    """Context manager that yields a new hidden folder beside `output`, and removes it at the end.
 
-    If the move fails, the earlier folder is restored. Raises OSError.
+    The block makes its result in a sub-folder, which `move_into_place` then renames to `output`.
     """
-    earlier = work / "earlier"
-    if output.exists():
-        replace(output, earlier)
+    work = temporary_name(Path(os.path.realpath(output)))
+    work.mkdir(parents=True)
     try:
-        replace(work / "result", output)
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def move_into_place(*moves: tuple[Path, Path]) -> None:
+    """Rename finished folders, which are in a `work_folder`, to their outputs, in place of earlier folders.
+
+    moves: the finished folder and the output of each rename.
+    If a rename fails, all earlier folders are restored. Raises OSError.
+    """
+    begun: list[tuple[Path, Path, Path]] = []
+    try:
+        for made, output in moves:
+            target, earlier = Path(os.path.realpath(output)), made.with_name(f"{made.name}.earlier")
+            begun.append((made, target, earlier))
+            if target.exists():
+                replace(target, earlier)
+            replace(made, target)
     except BaseException:
-        if earlier.exists():
-            replace(earlier, output)
+        for made, target, earlier in reversed(begun):
+            if target.exists() and not made.exists():
+                replace(target, made)
+            if earlier.exists():
+                replace(earlier, target)
         raise
 
 

@@ -23,10 +23,9 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.pictures import ColourConfig
+from clsplat.config.pictures import VIDEO_SUFFIXES, ColourConfig
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file, known_digest
-from clsplat.images.frame_files import VIDEO_SUFFIXES
 
 SRGB = "sRGB"
 """sRGB curve over Rec.709 primaries: the space of 8-bit photographs, and the default of models."""

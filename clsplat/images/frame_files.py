@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, Window
 from clsplat.config.channels import DEEP_CHANNELS, WRITABLE_CHANNELS
-from clsplat.config.pictures import Encoding
+from clsplat.config.pictures import VIDEO_SUFFIXES, Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
 from clsplat.images.reading import decodes, image_size, opened
@@ -44,8 +44,6 @@ _DISK_BLOCK_BYTES = 1 << 12
 
 FRAME_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
 """Lower-case extensions of the image files that frames are written to."""
-VIDEO_SUFFIXES = (".mp4", ".mov")
-"""Lower-case extensions of the videos that frames are written to."""
 MODEL_DIGEST_ATTRIBUTE, SETTINGS_DIGEST_ATTRIBUTE = "clsplat:model", "clsplat:settings"
 """EXR attributes with a frame's provenance: SHA-256 of the model file, and a digest of all other settings."""
 RECORD_TAGS = {

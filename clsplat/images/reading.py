@@ -2,6 +2,7 @@
 """Reading of images with OpenImageIO, resampling, and the search for images in folders.
 
 In memory an image is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), in the file's own colour space; nothing is linearised.
+Only photographs in Display P3 and Adobe RGB are converted, to sRGB.
 Alpha in memory is always straight (unassociated). In files it is straight in PNG, premultiplied (associated) in EXR.
 """
 
@@ -23,6 +24,7 @@ from clsplat.errors import InputError, examples, reason_of
 from clsplat.files.documents import is_file, open_input
 from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
+from clsplat.images.decoders.colour_profiles import in_srgb
 from clsplat.images.decoders.orientation import turned
 from clsplat.images.decoders.photo_decoders import (
     DECODED_PHOTO_EXTENSIONS,
@@ -267,14 +269,15 @@ def open_photograph(path: Path) -> Any:
     """Open a picture of any kind, as from a camera, like `open_image`.
 
     HEIF, AVIF and raw photographs, which OpenImageIO does not decode, give a `DecodedPhoto` with the same methods.
+    Photographs with an ICC profile of Display P3 or Adobe RGB give an `SrgbPhoto`, which converts their colours.
     """
     head = _first_bytes(path)
     decoder = decoder_of(path, head)
     if decoder is None:
-        return open_image(path, wrong_contents(path, head))
+        return in_srgb(open_image(path, wrong_contents(path, head)))
     source = decoder.open(path)
     _check_header(path, source.spec())
-    return source
+    return in_srgb(source)
 
 
 def open_image(path: Path, wrong: InputError | None = None) -> Any:

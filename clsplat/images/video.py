@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config.pictures import DEFAULT_VIDEO_FPS, ProRes, VideoConfig
+from clsplat.config.pictures import DEFAULT_VIDEO_FPS, VIDEO_SUFFIXES, ProRes, VideoConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files.atomic import DISK_FULL_ERRNOS, atomic_name
 from clsplat.files.documents import is_file
 from clsplat.files.names import native_name
 from clsplat.images.alpha import unassociate
 from clsplat.images.colour import REC709_LUMA_WEIGHTS
-from clsplat.images.frame_files import VIDEO_SUFFIXES, parse_record
+from clsplat.images.frame_files import parse_record
 
 _BLUE_CHROMA_RANGE, _RED_CHROMA_RANGE = (np.float32(2 * (1 - REC709_LUMA_WEIGHTS[index])) for index in (2, 0))
 """Divisors of B - Y and R - Y (Rec.709) that make chroma range from -0.5 to 0.5."""

@@ -77,22 +77,14 @@ def scene_of(run: Run) -> Scene | str:
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
-    masks = run.config.mask_use
+    arguments = run.config.scene_arguments()
     try:
         if detect(source) == "photos":
             source = reconstruction_folder(source.resolve())
             if not source.is_dir():
                 return "the scene is a folder of photos or a video, and its reconstruction no longer exists"
-            masks = after_sfm(masks, source)
-        return load_scene(
-            source,
-            resolution=run.config.resolution,
-            test_every=run.config.test_every,
-            test_most=run.config.test_most,
-            masks=masks,
-            lenses=run.config.lenses,
-            missing=run.config.missing,
-        )
+            arguments["masks"] = after_sfm(arguments["masks"], source)
+        return load_scene(source, **arguments)
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"
 

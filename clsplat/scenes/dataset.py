@@ -256,6 +256,8 @@ class SceneFrame:
     metres: True if world units are metres.
     origin: latitude and longitude in degrees and altitude in metres of the world's origin; () if unknown. If known,
         the world's x axis points east, and z north.
+    measured: the coordinates of two points that gave the scale, and the scale of world_from_source when they were
+        measured; () if no points gave it.
     up_note, scale_note: what the up direction and the unit come from, for the user; "" if neither was set.
     """
 
@@ -263,6 +265,7 @@ class SceneFrame:
     upright: bool = False
     metres: bool = False
     origin: tuple[float, ...] = ()
+    measured: tuple[float, ...] = ()
     up_note: str = ""
     scale_note: str = ""
 
@@ -290,6 +293,7 @@ class SceneFrame:
             "upright": self.upright,
             "metres": self.metres,
             "origin": list(self.origin),
+            "measured": list(self.measured),
             "up_note": self.up_note,
             "scale_note": self.scale_note,
         }

@@ -62,6 +62,7 @@ def load_scene(
     masks: MaskUse = NO_MASKS,
     missing: Missing = "few",
     frame: FrameUse | SceneFrame = AS_IN_FILES,
+    frames: int | None = None,
 ) -> Scene:
     """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
@@ -79,6 +80,8 @@ def load_scene(
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
     frame: a change of the files' frame, such as `FrameUse("up")`, or the frame of an earlier run, which the scene gets.
+    frames: number of frames to take from each video. None uses frames that were taken before, of any number, and else
+        chooses the number by the video's length and motion.
 
     A folder of photographs or videos, and a video, goes through `clsplat.scenes.sfm.reconstruct` first. An earlier
     result for the same photographs is reused.
@@ -94,13 +97,15 @@ def load_scene(
     path = Path(path)
     _check_counts(resolution=resolution, test_every=test_every, test_most=test_most)
     kind = detect(path)
+    if frames is not None and kind != "photos":
+        raise InputError(f"--frames {frames}: {path} is a scene with cameras, expected a video or a folder with videos")
     if images is not None and kind == "photos":
         raise InputError(
             f"{path}: is a folder of photos; another folder of images can be chosen only for a scene with cameras"
         )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        files = _reframed(_read(path, kind, images, missing, masks, work_dir, progress), path, frame)
+        files = _reframed(_read(path, kind, images, missing, masks, work_dir, frames, progress), path, frame)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
         # Outlier cameras are not checked, because `_scene` has already warned of them.
@@ -142,11 +147,12 @@ def _read(
     missing: Missing,
     masks: MaskUse,
     work_dir: Path | None,
+    frames: int | None,
     progress: Progress | None,
 ) -> _SceneFiles:
     """Read a data set of the layout `kind`. For photographs, run structure from motion first.
 
-    images, missing, masks, work_dir, progress: as for `load_scene`.
+    images, missing, masks, work_dir, frames, progress: as for `load_scene`.
     """
     if kind in ("blender", "transforms"):
         return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
@@ -154,7 +160,7 @@ def _read(
     if kind == "photos":
         photos = path.resolve()
         folder = work_dir or reconstruction_folder(photos)
-        folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
+        folder = reconstruct(photos, folder, masks=for_sfm(masks), frames=frames, progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)
     return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)

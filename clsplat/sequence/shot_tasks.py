@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import HoldoutConfig, SamplingConfig
+from clsplat.config.pictures import VIDEO_SUFFIXES, HoldoutConfig, SamplingConfig
 from clsplat.errors import InputError, examples, warn
-from clsplat.images.frame_files import VIDEO_SUFFIXES
 from clsplat.images.holdouts import check_holdout
 from clsplat.sequence.task import Task
 from clsplat.shots import Shot

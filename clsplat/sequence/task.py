@@ -16,6 +16,7 @@ import numpy as np
 from clsplat.camera import DEFAULT_NEAR_PLANE, JACOBIAN_CLAMP_HALF_FRAMES, Camera
 from clsplat.config.channels import WRITABLE_CHANNELS
 from clsplat.config.pictures import (
+    VIDEO_SUFFIXES,
     DeepConfig,
     Encoding,
     FramingConfig,
@@ -33,7 +34,6 @@ from clsplat.images.colour import CHROMATICITIES, COLOR_INTEROP_IDS, SRGB, confi
 from clsplat.images.cryptomatte import header_of
 from clsplat.images.frame_files import (
     SETTINGS_DIGEST_ATTRIBUTE,
-    VIDEO_SUFFIXES,
     FrameFileHeader,
     camera_matrices,
     is_whole_panorama,

@@ -75,7 +75,8 @@ def test_each_video_of_a_folder_of_frames_has_a_camera(videos: Path, tmp_path: P
     photographs_of([videos / name / "walk.mp4" for name in ("a", "b")], folder, 4, no_progress)
     names = [path.relative_to(folder.frames).as_posix() for path in folder.frames.rglob("*.jpg")]
     photos = [Photo(name, name, 64, 48, ("", "", "")) for name in (*names, "photo.jpg")]
-    found = frames_of_videos(folder.frames, folder.scene, None, no_progress)
+    with frames_of_videos(folder.frames, folder.scene, None, no_progress) as found:
+        pass
     groups = camera_groups(found.by_video(photos), "auto")
     assert sorted(sorted({name.rpartition("/")[0] for name in group}) for group in groups) == [
         [""],

@@ -20,9 +20,11 @@ from clsplat.scenes.analysis.photo_findings import findings
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct
+from clsplat.scenes.sfm.video_frames import VideoFrames
 from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, find_masks, masks_beside, read_mask
 
 IGNORE = MaskUse("ignore")
+NO_VIDEOS = VideoFrames(Path("none"))
 
 
 def mask_of(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
@@ -196,7 +198,7 @@ def test_masks_of_other_programs(photo: str, mask: str, tmp_path: Path) -> None:
     assert masks_beside(images) == {photo: tmp_path / mask}
     paths, _ = sfm_photos.find_photos(tmp_path / "images")
     assert sorted(paths) == sorted(image.path for image in images)
-    assert reconstruct._masks(tmp_path / "images", paths, IGNORE) == {photo: tmp_path / mask}
+    assert reconstruct._masks(tmp_path / "images", paths, IGNORE, NO_VIDEOS) == {photo: tmp_path / mask}
     present = find_images(tmp_path / "images")
     listed = {image.path for image in images}
     assert {path for path in present if path not in listed} == companions(
@@ -218,7 +220,7 @@ def test_folders_of_masks_by_other_names(mask: str, tmp_path: Path) -> None:
     assert masks_beside(images) == {}
     found = {"IMG_1.jpg": tmp_path / mask}
     assert masks_beside(images, others=OTHER_MASK_FOLDERS) == found
-    assert reconstruct._masks(tmp_path / "images", [image.path for image in images], IGNORE) == found
+    assert reconstruct._masks(tmp_path / "images", [image.path for image in images], IGNORE, NO_VIDEOS) == found
     masks_at(tmp_path, "masks/IMG_1.png")  # these go first
     assert masks_beside(images, others=OTHER_MASK_FOLDERS) == {"IMG_1.jpg": tmp_path / "masks" / "IMG_1.png"}
 
@@ -237,7 +239,7 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
     inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]
     paths = sorted((scene / "images").iterdir())
-    warned("white pixels are the ones to keep", reconstruct._masks, scene / "images", paths, IGNORE)
+    warned("white pixels are the ones to keep", reconstruct._masks, scene / "images", paths, IGNORE, NO_VIDEOS)
 
 
 @pytest.mark.brings("renderers, video tools", "masks/mask_0007.png for image_0007.png", "by their numbers")

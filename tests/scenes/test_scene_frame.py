@@ -175,7 +175,7 @@ def test_a_reconstruction_is_turned_in_its_files_and_back(result: Path) -> None:
     assert scene.world_from_files is None
     model = pycolmap.Reconstruction(result / MODEL_FOLDER)
     model.update_point_3d_errors()
-    assert not list(result.glob(".frame-*"))
+    assert [path.name for path in (result / "sparse").iterdir()] == ["0"]
     again = set_frame(result, result / "images", UP, result)  # it is upright: nothing changes
     assert again.world_from_source.tolist() == frame.world_from_source.tolist()
     set_frame(result, result / "images", FrameUse("none"), result)
@@ -202,6 +202,41 @@ def test_a_scale_keeps_the_axes_and_a_second_one_replaces_it(result: Path) -> No
     assert frame.metres
     assert not frame.upright
     np.testing.assert_array_equal(np.diag(np.diag(frame.world_from_source)), frame.world_from_source)
+
+
+@pytest.mark.parametrize("scale", ["0,0,0,0.5,0,0=2", "view00,view10=8"])
+def test_the_same_scale_twice_is_the_same_result(scale: str, result: Path) -> None:
+    set_frame(result, result / "images", UP, result)
+    before = load_scene(result)
+    first = set_frame(result, result / "images", FrameUse(None, scale), result)
+    files = {path.name: path.read_bytes() for path in (result / MODEL_FOLDER).iterdir()}
+    assert set_frame(result, result / "images", FrameUse(None, scale), result).notes == first.notes
+    assert {path.name: path.read_bytes() for path in (result / MODEL_FOLDER).iterdir()} == files
+    trained = load_scene(result, frame=FrameUse(None, scale))  # as in training on the scene that sfm scaled
+    np.testing.assert_array_equal(trained.frame.world_from_source, first.world_from_source)
+    np.testing.assert_array_equal(trained.points, load_scene(result).points)
+    if scale.startswith("0,"):
+        np.testing.assert_allclose(trained.points, 4 * before.points, atol=1e-12)  # coordinates up to 30
+
+
+def test_points_measured_before_the_scene_was_scaled(result: Path) -> None:
+    """Another length for the same points corrects the first. Other points are measured in the scaled scene."""
+    before = load_scene(result).points
+    # 0.5 units are 2 m, then 3 m instead; a second length in between changes nothing about these points; in the scene
+    # that is scaled by 6, 2 units are now measured as 1 m
+    for scale, factor in (
+        ("0,0,0,0.5,0,0=2", 4.0),
+        ("0,0,0,0.5,0,0=3", 6.0),
+        ("view00,view10=9", None),
+        ("0,0,0,0.5,0,0=3", 6.0),
+        ("0,0,0,0,2,0=1", 3.0),
+        ("0,0,0,0,2,0=1", 3.0),
+    ):
+        frame = set_frame(result, result / "images", FrameUse(None, scale), result)
+        assert frame.metres
+        assert frame.scale_note.startswith(f"metres are from the known length {scale}: a unit was ")
+        if factor is not None:
+            np.testing.assert_allclose(load_scene(result).points, factor * before, atol=1e-12)
 
 
 def test_a_run_keeps_its_frame_when_the_scene_gets_another(result: Path) -> None:
@@ -308,13 +343,18 @@ def test_a_reconstruction_is_never_lost_to_its_frame(tmp_path: Path) -> None:
 def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 0.1 * TURN, (1 / 3, 2e9, -1e-9)
-    frame = SceneFrame(matrix, True, True, (48.1, 11.5, 520.0), "up is from x", "metres are from y")
+    frame = SceneFrame(
+        matrix, True, True, (48.1, 11.5, 520.0), (0.1, 0, 0, 1, 2, 3, 0.3), "up is from x", "metres are from y"
+    )
     (tmp_path / FRAME_RECORD_FILE).write_bytes(frame.content())
     found = read_frame(tmp_path)
     assert found.document() == frame.document()
     assert found.change_from(frame) is None
     assert found.notes == ["up is from x", "metres are from y"]
     assert read_frame(tmp_path / "nowhere") is SOURCE_FRAME
+    older = {key: value for key, value in frame.document().items() if key != "measured"}
+    (tmp_path / FRAME_RECORD_FILE).write_text(json.dumps(older))
+    assert read_frame(tmp_path).measured == ()
 
 
 @pytest.mark.parametrize(
@@ -328,6 +368,8 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         {"metres": None},
         {"origin": [1]},
         {"origin": ["a", "b", "c"]},
+        {"measured": [1, 2, 3]},
+        {"measured": [0, 0, 0, 1, 0, 0, 0]},
         {"up_note": 3},
         {"scale_note": None},
     ],

@@ -25,6 +25,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.scenes.sfm import worker
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
 from clsplat.scenes.sfm.pipeline import database as sfm_database
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
@@ -105,7 +106,7 @@ def test_every_pose_is_recovered(scene, pictures):
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     assert camera.params[0] == pytest.approx(pictures[1][0].fx, rel=0.02)
 
-    record = json.loads((output / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((output / SFM_RECORD_FILE).read_text())
     assert record["unregistered"] == []
     assert record["photos"] == len(record["registered"]) == COUNT
     assert record["mean_reprojection_error"] < 0.5
@@ -158,7 +159,7 @@ def test_same_seed_same_bytes(scene, photos, tmp_path):
 def test_every_choice_gives_the_same_bytes_twice(choice, photos, tmp_path):
     settings = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE", **choice)
     scenes = [sfm.reconstruct(photos, tmp_path / str(threads), settings, threads=threads) for threads in (1, 3)]
-    record = json.loads((scenes[0] / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((scenes[0] / SFM_RECORD_FILE).read_text())
     assert len(record["registered"]) == COUNT
     assert record["mean_reprojection_error"] < 0.5
     assert choice.items() <= record.items()
@@ -176,7 +177,7 @@ def test_photographs_of_two_things_are_two_models(pictures, tmp_path):
     (message,) = warnings_of(lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", PINHOLE))
     assert "6 photo(s) (b 0.jpg, b 1.jpg, b 2.jpg and 3 more) form a model of their own, with too few" in message
     assert f"to the {COUNT} photo(s) that are used" in message
-    record = json.loads((tmp_path / "scene" / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((tmp_path / "scene" / SFM_RECORD_FILE).read_text())
     assert record["fragments"] == [[f"b {index}.jpg" for index in range(6)]]
     assert len(record["registered"]) == COUNT
 
@@ -247,7 +248,7 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
     messages = warnings_of(lambda: sfm.reconstruct(folder, output))
     assert any("phone.gif" in message for message in messages)
     assert any("stray.jpg" in message and "no camera pose was found" in message for message in messages)
-    assert json.loads((output / sfm.SFM_RECORD_FILE).read_text())["unregistered"] == ["stray.jpg"]
+    assert json.loads((output / SFM_RECORD_FILE).read_text())["unregistered"] == ["stray.jpg"]
 
     found = sorted(path.relative_to(output / "images").as_posix() for path in (output / "images").rglob("*.JPG"))
     assert found == [f"{'left' if index < 6 else 'right'}/{index:02d}.JPG" for index in range(COUNT)]
@@ -343,8 +344,9 @@ def task_of(monkeypatch):
         tasks.append(task)
         return {"result": {"registered": sorted(name for group in task["groups"] for name in group), "fragments": []}}
 
-    def move(work, output):
-        tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
+    def move(move):
+        photos = move[0].parent / "photos"
+        tasks.append({path.name: path.read_bytes() for path in photos.rglob("*") if path.is_file()})
 
     monkeypatch.setattr(sfm, "run_worker", run)
     monkeypatch.setattr(sfm, "turn_new", lambda *_: None)
@@ -415,7 +417,7 @@ def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkey
 def test_the_whole_demo_registers(tmp_path):
     ray_caster.write_photos(tmp_path / "photos")
     output = sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", PINHOLE)
-    record = json.loads((output / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((output / SFM_RECORD_FILE).read_text())
     assert record["unregistered"] == []
     assert record["points"] > 2000
     assert record["mean_reprojection_error"] < 0.3

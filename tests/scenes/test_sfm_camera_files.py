@@ -21,6 +21,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.sfm import focal_lengths, worker
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct as sfm
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
 
 pytestmark = [pytest.mark.needs("pillow_heif"), pytest.mark.needs("rawpy")]
 
@@ -161,7 +162,7 @@ def test_cameras_of_heic_and_raw_photographs(tmp_path, pictures):
     )
     assert "photos: the focal length found is " in message and "-50% from EXIF's" in message
     assert "(00.dng.jpg and 11 more)" in message
-    record = json.loads((tmp_path / "scene" / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((tmp_path / "scene" / SFM_RECORD_FILE).read_text())
     assert record["unregistered"] == [] and len(record["focal_lengths"]) == 1
     assert record["focal_lengths"][0]["found_px"] == pytest.approx(pictures[1][0].fx, rel=0.03)
     scene = load_scene(tmp_path / "scene")

@@ -100,7 +100,10 @@ def test_the_same_bytes_twice_and_an_existing_result(video: Path, tmp_path: Path
     assert (tmp_path / "a" / FRAME_TABLE_FILE).stat().st_mtime_ns == before
     assert frame_sequences(tmp_path / "a") == [first.names]
     refuses("a: has frames of other videos, or another number of frames", take_frames, [video], tmp_path / "a", count=7)
+    refuses("without --frames, frames of the same videos are used", take_frames, [video], tmp_path / "a", count=7)
+    assert take_frames([video], tmp_path / "a").names == first.names  # no number is asked for
     (tmp_path / "a" / first.names[2]).unlink()
+    refuses(r"a: walk\.mp4/\d+\.jpg were removed or changed; give this folder", take_frames, [video], tmp_path / "a")
     refuses(
         r"a: walk\.mp4/\d+\.jpg were removed or changed; give this folder",
         take_frames,
@@ -110,6 +113,11 @@ def test_the_same_bytes_twice_and_an_existing_result(video: Path, tmp_path: Path
     )
     assert frame_sequences(tmp_path / "a") == [[name for name in first.names if name != first.names[2]]]
     assert len(take_frames([video], tmp_path / "a", count=4, overwrite=True).names) == 4
+    assert len(take_frames([video], tmp_path / "a", overwrite=True).names) == 4  # no number is asked for
+    mask = Path(shutil.copy(tmp_path / "a" / first.names[0], tmp_path / "a" / "mask.jpg"))
+    told = r"a: has pictures beside its frames \(mask\.jpg\), which would be removed"
+    refuses(told, take_frames, [video], tmp_path / "a", count=6, overwrite=True)
+    mask.unlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "walk.mp4"]
 
 

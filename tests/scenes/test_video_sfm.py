@@ -12,14 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import Capture, refuses, warnings_of
+from calls import Capture, raising, refuses, warnings_of
 from needs import require
 from pictures import write_pixels
+from tiny import write_scene
 from walk_videos import sliding, walk, write_walk
 
 from clsplat.cli.main import main
+from clsplat.config.masks import MaskUse
+from clsplat.errors import InputError
+from clsplat.scenes import loading
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.sfm import reconstruct as sfm
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
 from clsplat.scenes.sfm.video_frames import find_videos, frames_folder, reconstruction_folder
 from clsplat.scenes.video.frames import frame_sequences, take_frames
 
@@ -77,6 +82,124 @@ def test_a_video_alone(video: Path, tmp_path: Path, tasks: list[dict[str, Any]])
     refuses("scene_frames: has frames of other videos", sfm.reconstruct, video, tmp_path / "scene", frames=5)
     sfm.reconstruct(video, tmp_path / "scene", frames=5, overwrite=True)
     assert len(tasks) == 2
+
+
+def test_folders_that_clsplat_made_are_left_out(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    """NAME_frames and NAME_colmap beside the videos of a folder, which are known by their records, not their names."""
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    one = Path(shutil.copy(video, folder / "one.mp4"))
+    sfm.reconstruct(one, folder / "one_colmap", frames=6)
+    two = Path(shutil.copy(video, folder / "two.mp4"))
+    (folder / "one_colmap").rename(folder / "scene")
+    kept = folder / "kept_frames" / "7.png"  # has a table and a record of other programs
+    write_pixels(kept, np.rint(255 * FRAMES[7]).astype(np.uint8))
+    (kept.parent / "frames.json").write_text('{"frames": []}')
+    (kept.parent / SFM_RECORD_FILE).write_text("[]")
+    messages = warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "all", frames=4))
+    assert {name.rpartition("/")[0] for name in names_of(tasks[-1])} == {"kept_frames", "one.mp4", "two.mp4"}
+    told = (
+        "shots: 2 folder(s) (one_frames, scene) left out: made by clsplat from a video or photos; to use such pictures"
+    )
+    assert len([text for text in messages if told in text]) == 1
+    # each of them can be given itself
+    sfm.reconstruct(folder / "one_frames", tmp_path / "frames")
+    assert len(names_of(tasks[-1])) == len(names_of(tasks[0]))
+    one.unlink()
+    two.unlink()
+    kept.unlink()
+    refuses(
+        "shots: no photos found, only in one_frames, scene, made by clsplat",
+        sfm.reconstruct,
+        folder,
+        tmp_path / "x",
+    )
+
+
+def test_masks_of_frames(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    """Masks are found beside the frames whether the video, the folder of its frames, or the video's folder is given."""
+    scene, frames = tmp_path / "scene", tmp_path / "scene_frames"
+    sfm.reconstruct(video, scene, frames=6)
+    use = MaskUse("ignore")
+    told = (
+        r"walk\.mp4: has no masks, expected masks/walk\.mp4/\d+\.jpg\.png in .*scene_frames, its folder of frames, or"
+    )
+    refuses(told, sfm.reconstruct, video, scene, masks=use, overwrite=True)
+    masked = names_of(tasks[0])[1:]
+    for name in masked:
+        write_pixels(frames / "masks" / f"{name}.png", np.full((72, 96, 3), 255, np.uint8))
+    sfm.reconstruct(frames, tmp_path / "other", masks=use)
+    sfm.reconstruct(video, scene, masks=use, overwrite=True)
+    assert [sorted(task["masks"]) for task in tasks[1:]] == [masked, masked]
+    refuses("scene_frames: has pictures beside its frames", sfm.reconstruct, video, scene, frames=5, overwrite=True)
+
+    folder = tmp_path / "shot"
+    folder.mkdir()
+    shutil.copy(video, folder / "walk.mp4")
+    for index in (10, 14, 18):
+        write_pixels(folder / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
+    sfm.reconstruct(folder, tmp_path / "mixed", frames=6)
+    shutil.copytree(frames / "masks", tmp_path / "masks")  # beside both folders
+    write_pixels(tmp_path / "masks" / "14.png", np.full((72, 96, 3), 255, np.uint8))
+    sfm.reconstruct(folder, tmp_path / "mixed", masks=use, overwrite=True)
+    assert sorted(tasks[-1]["masks"]) == ["14.png", *masked]
+
+
+def test_what_is_replaced_stays_whole_until_the_new_scene_is_complete(
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "scene"
+    sfm.reconstruct(video, scene, frames=6)
+
+    def contents() -> dict[str, bytes]:
+        files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
+        return {path.relative_to(tmp_path).as_posix(): path.read_bytes() for path in files}
+
+    before, run_worker, move = contents(), sfm.run_worker, sfm.move_into_place
+    for trouble in (InputError("no cameras"), KeyboardInterrupt()):
+        monkeypatch.setattr(sfm, "run_worker", raising(trouble))
+        with pytest.raises(type(trouble)):
+            sfm.reconstruct(video, scene, frames=5, overwrite=True)
+        assert contents() == before
+    monkeypatch.setattr(sfm, "run_worker", run_worker)
+    # the scene cannot be renamed, as when another program has it open on Windows: the frames go back too
+    monkeypatch.setattr(sfm, "move_into_place", lambda frames, scene: move(frames, (tmp_path / "none", scene[1])))
+    with pytest.raises(FileNotFoundError):
+        sfm.reconstruct(video, scene, frames=5, overwrite=True)
+    assert contents() == before
+    monkeypatch.setattr(sfm, "move_into_place", move)
+    sfm.reconstruct(video, scene, frames=5, overwrite=True)
+    assert names_of(tasks[-1]) == frame_sequences(tmp_path / "scene_frames")[0]
+    assert 0 < len(names_of(tasks[-1])) <= 5
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene", "scene_frames"]
+
+
+def test_training_takes_the_frames_that_sfm_made(
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    given: list[object] = []
+
+    def reconstruct(*paths: Any, frames: int | None, **named: Any) -> Path:
+        given.append(frames)
+        sfm.reconstruct(*paths, frames=frames, **named)
+        raise InputError("cameras are there")  # the fake worker writes no model to train on
+
+    monkeypatch.setattr(loading, "reconstruct", reconstruct)
+    walk_mp4 = Path(shutil.copy(video, tmp_path / "walk.mp4"))
+    assert main(["sfm", str(walk_mp4), "-o", str(tmp_path / "walk_colmap"), "--frames", "6"]) == 0
+    train = ["train", str(walk_mp4), "-o", str(tmp_path / "run")]
+    for more in ([], ["--frames", "6"]):
+        capsys.readouterr()
+        assert main([*train, *more]) == 2
+        assert "cameras are there" in capsys.readouterr().err
+    assert len(tasks) == 1, "the same frames, so the same cameras"
+    assert main([*train, "--frames", "5"]) == 2
+    assert "walk_frames: has frames of other videos, or another number of frames" in capsys.readouterr().err
+    assert given == [None, 6, 5]
+    assert main([*train, "--frames", "0"]) == 2
+    assert "--frames 0: expected at least 1" in capsys.readouterr().err
+    assert main(["train", str(write_scene(tmp_path / "scene")), *train[2:], "--frames", "5"]) == 2
+    assert "--frames 5: " in (said := capsys.readouterr().err) and "is a scene with cameras, expected a video" in said
 
 
 def test_videos_and_photographs_in_one_folder_are_several_cameras(
@@ -210,6 +333,6 @@ def test_the_command_line_refuses_what_is_no_video(
 def test_cameras_of_a_video(tmp_path: Path) -> None:
     video = write_walk(tmp_path / "walk.mp4", walk(320, 240, 40, sub_frames=1).frames)
     scene = sfm.reconstruct(video, tmp_path / "scene", sfm.SfmSettings(camera_model="SIMPLE_PINHOLE"))
-    record = json.loads((scene / sfm.SFM_RECORD_FILE).read_text())
+    record = json.loads((scene / SFM_RECORD_FILE).read_text())
     assert record["photos"] >= 10
     assert len(record["registered"]) >= 0.8 * record["photos"]

@@ -42,10 +42,10 @@ def exif_bytes(
     return record.tobytes()
 
 
-def write_heic(path: Path, pixels: NDArray[Any], exif: bytes = b"", **settings: Any) -> Path:
+def write_heic(path: Path, pixels: NDArray[Any], exif: bytes = b"", *, profile: bytes = b"", **settings: Any) -> Path:
     """Write stored pixels (H, W, 3 or 4) of uint8, or of uint16 from 0 to 1023, as HEIC; without loss by default.
 
-    An orientation in `exif` becomes the file's properties irot and imir.
+    An orientation in `exif` becomes the file's properties irot and imir. profile: an ICC profile.
     """
     import pillow_heif
 
@@ -54,7 +54,9 @@ def write_heic(path: Path, pixels: NDArray[Any], exif: bytes = b"", **settings: 
     if pixels.dtype == np.uint16:
         mode, data = f"{mode};16", pixels << 6
     file = pillow_heif.HeifFile()
-    file.add_frombytes(mode, (width, height), np.ascontiguousarray(data).tobytes())
+    frame = file.add_frombytes(mode, (width, height), np.ascontiguousarray(data).tobytes())
+    if profile:
+        frame.info["icc_profile"], frame.info["icc_profile_type"] = profile, "prof"
     lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
     file.save(path, **({"exif": exif} if exif else {}), **(settings or lossless))
     return path

@@ -151,9 +151,11 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         lenses: str,
         missing: str,
         frame: object,
+        frames: int | None = None,
         progress: Callable[..., None],
     ) -> Any:
         assert (masks, lenses, missing) == (NO_MASKS, "undistort", "few")
+        assert frames is None
         assert frame in (AS_IN_FILES, SOURCE_FRAME), "the run has no frame.json"
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")

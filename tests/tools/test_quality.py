@@ -28,7 +28,8 @@ from clsplat.images.reading import read_image
 from clsplat.scenes.analysis.photo_findings import Finding
 from clsplat.scenes.analysis.recommendations import answered
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
+from clsplat.scenes.sfm.reconstruct import SfmSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 LEVEL = 1 / 255

@@ -30,6 +30,7 @@ only-include = ["clsplat", "docs", "README.md"]
     "CHANGELOG.md": f"# Changelog\n\n## [Unreleased]\n\n{SECTION}",
     "README.md": "".join(release_checks.INSTALLS["README.md"].values()),
     "docs/install.md": "".join(release_checks.INSTALLS["docs/install.md"].values()),
+    "docs/more/formats.md": "`pip install 'clsplat[photos]'`, or `pip install -e '.[dev]'` in a checkout\n",
     "clsplat/__init__.py": "# SPDX-License-Identifier: Apache-2.0\n",
     "REUSE.toml": """version = 1
 [[annotations]]
@@ -179,14 +180,47 @@ def test_a_folder_without_git_ends_with_a_message(tmp_path: Path) -> None:
 def test_prepare_writes_what_check_asks_for(checkout: Path) -> None:
     for name, lines in release_checks.INSTALLS.items():
         (checkout / name).write_text("".join(lines), "utf-8")
+    page = checkout / "docs" / "more" / "formats.md"
+    page.write_text(FILES["docs/more/formats.md"].replace("clsplat[", ".["), "utf-8")
     (checkout / "CHANGELOG.md").write_text("# Changelog\n\n## [Unreleased]\n\n### Added\n\n- Everything.\n")
     assert len(failed(checkout)) == 3  # and the tree
     names = release_checks.prepare(checkout, "2026-11-30")
-    assert names == ["CHANGELOG.md", "CITATION.cff", "README.md", "docs/install.md"]
+    assert names == ["CHANGELOG.md", "CITATION.cff", "README.md", "docs/install.md", "docs/more/formats.md"]
+    assert page.read_text() == FILES["docs/more/formats.md"]
     assert (checkout / "CHANGELOG.md").read_text() == FILES["CHANGELOG.md"]
     assert (checkout / "CITATION.cff").read_text() == "title: clsplat\nversion: 0.1.0\ndate-released: 2026-11-30\n"
     assert list(failed(checkout)) == ["clean tree"]
     assert release_checks.prepare(checkout, "2026-11-30") == []
+
+
+@pytest.mark.parametrize(
+    ("line", "released"),
+    [
+        (".venv/bin/pip install .", ".venv/bin/pip install clsplat"),
+        ("`pip install .` there", "`pip install clsplat` there"),
+        ("`pip install '.[view]'`, `'.[jax]'`", "`pip install 'clsplat[view]'`, `'clsplat[jax]'`"),
+        ("pip install -e '.[docs,dev]'", "pip install -e '.[docs,dev]'"),
+        ("pip install .venv/x.whl ./y.whl", "pip install .venv/x.whl ./y.whl"),
+    ],
+)
+def test_lines_about_installing(line: str, released: str) -> None:
+    assert release_checks.from_index("docs/library.md", f"{line}\n") == f"{released}\n"
+
+
+def test_every_page_that_tells_how_to_install_is_prepared() -> None:
+    """Afterwards only editable installs are of a checkout. CONTRIBUTING is about a checkout, and stays."""
+    names = release_checks.pages(ROOT)
+    texts = {name: (ROOT / name).read_text("utf-8") for name in names}
+    released = {name: release_checks.from_index(name, text) for name, text in texts.items()}
+    assert {"README.md", "docs/coming-from.md", "docs/gpus/devices.md"} <= set(names)
+    assert "CONTRIBUTING.md" not in names
+    if released["README.md"] != texts["README.md"]:  # before the first release
+        changed = {name for name in names if released[name] != texts[name]}
+        assert changed >= {"README.md", "docs/install.md", "docs/conventions.md", "docs/library.md", "docs/render.md"}
+    for name, text in released.items():
+        for line in text.splitlines():
+            assert "-e '.[" in line or not ("'.[" in line or "pip install . " in f"{line} "), (name, line)
+            assert not ("pip" in line and "checkout" in line), (name, line)
 
 
 def test_this_checkout_can_be_prepared() -> None:

@@ -31,19 +31,13 @@ VERSIONED = {
 }
 """Patterns of the version in the files beside pyproject.toml that state it, by file."""
 INSTALLS = {
-    "README.md": {
-        ".venv/bin/pip install .      # from a checkout; Windows: .venv\\Scripts": (
-            ".venv/bin/pip install clsplat      # Windows: .venv\\Scripts"
-        )
-    },
-    "docs/install.md": {
-        "From a checkout:": "With Python's own tools:",
-        ".venv/bin/pip install .\n": ".venv/bin/pip install clsplat\n",
-        "pip install '.[": "pip install 'clsplat[",
-        ", `'.[": ", `'clsplat[",
-    },
+    "README.md": {"      # from a checkout; Windows: .venv\\Scripts": "      # Windows: .venv\\Scripts"},
+    "docs/install.md": {"From a checkout:": "With Python's own tools:"},
 }
-"""Lines about installing, by file: before the first upload to the package index, and the lines that replace them."""
+"""Lines that speak of a checkout, by file: before the first upload to the package index, and what replaces them."""
+CHECKOUT_FOLDER = re.compile(r"(?<=pip install )\.(?=[\s`])|(?<!-e ')(?<=')\.(?=\[)")
+"""The folder of the checkout in what pip installs, such as the dot in '.[view]', which becomes the package's name. An
+editable install (-e) stays one of a checkout, as do all in CONTRIBUTING.md, which is for developers."""
 MOST_NAMED = 5
 """Number of files that a message names before it counts the others."""
 
@@ -112,13 +106,28 @@ def changelog_problem(root: Path, version: str) -> str:
 
 
 def install_problem(root: Path) -> str:
-    """Check that README and docs/install.md install from the package index. Returns the problem or ""."""
-    for name, lines in INSTALLS.items():
+    """Check that README and all pages install from the package index. Returns the problem or ""."""
+    advice = "tools/release --prepare changes the lines about installing"
+    for name in pages(root):
         text = (root / name).read_text("utf-8")
-        for before, after in lines.items():
-            if before in text or after not in text:
-                return f"{name}: no line {after.strip()}; tools/release --prepare changes the lines about installing"
+        changed = [line for line in text.splitlines() if from_index(name, line) != line]
+        if changed:
+            return f"{name}: the line {changed[0].strip()[:80]!r} installs from a checkout; {advice}"
+        if missing := [after for after in INSTALLS.get(name, {}).values() if after not in text]:
+            return f"{name}: no line {missing[0].strip()}; {advice}"
     return ""
+
+
+def pages(root: Path) -> list[str]:
+    """Names of the files that tell users how to install: README and the pages of the docs."""
+    return ["README.md", *sorted(path.relative_to(root).as_posix() for path in (root / "docs").rglob("*.md"))]
+
+
+def from_index(name: str, text: str) -> str:
+    """Return lines of a file with packages from the package index in place of a checkout. name: the file's."""
+    for before, after in INSTALLS.get(name, {}).items():
+        text = text.replace(before, after)
+    return CHECKOUT_FOLDER.sub("clsplat", text)
 
 
 def tree_problem(root: Path) -> str:
@@ -189,16 +198,15 @@ def prepare(root: Path, date: str) -> list[str]:
     date: date of the release, such as 2026-11-30.
     """
     version = project(root)["version"]
-    texts = {name: (root / name).read_text("utf-8") for name in ("CHANGELOG.md", "CITATION.cff", *INSTALLS)}
+    texts = {name: (root / name).read_text("utf-8") for name in ("CHANGELOG.md", "CITATION.cff", *pages(root))}
     new = dict(texts)
     if f"\n## [{version}]" not in texts["CHANGELOG.md"]:
         top = "## [Unreleased]\n"
         new["CHANGELOG.md"] = texts["CHANGELOG.md"].replace(top, f"{top}\n## [{version}] - {date}\n", 1)
     dated = re.sub(r"^date-released:.*\n", "", texts["CITATION.cff"], flags=re.MULTILINE)
     new["CITATION.cff"] = re.sub(r"^(version: .*\n)", rf"\1date-released: {date}\n", dated, count=1, flags=re.MULTILINE)
-    for name, lines in INSTALLS.items():
-        for before, after in lines.items():
-            new[name] = new[name].replace(before, after)
+    for name in pages(root):
+        new[name] = from_index(name, new[name])
     changed = [name for name, text in texts.items() if new[name] != text]
     for name in changed:
         (root / name).write_text(new[name], "utf-8")

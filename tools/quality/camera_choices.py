@@ -11,7 +11,8 @@ from typing import Any
 from quality.trainings import Rows, trained
 
 from clsplat.errors import InputError
-from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings, reconstruct
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
+from clsplat.scenes.sfm.reconstruct import SfmSettings, reconstruct
 
 COLUMNS = {
     "features": ("features", "learned features"),

@@ -67,8 +67,8 @@ TRAIN = " ".join(["train {scene} -o {out}/run --iterations", str(LONG), *(word o
 VERBS = (
     Verb("devices", "devices", "pyopencl", writes=False),
     Verb("demo", "demo -o {out}/demo --iterations 100", "/demo/photos"),
-    Verb("capture", "capture {photos} -o {out}/shot --iterations 100", "/shot/.scene-sfm-*/database.db"),
-    Verb("sfm", "sfm {photos} -o {out}/scene", "/.scene-sfm-*/database.db"),
+    Verb("capture", "capture {photos} -o {out}/shot --iterations 100", "/shot/.scene.*/database.db"),
+    Verb("sfm", "sfm {photos} -o {out}/scene", "/.scene.*/database.db"),
     Verb("train", TRAIN, "/run/metrics.jsonl"),
     Verb("eval", "eval {out}/run", "clsplat.progress"),
     Verb("render", "render {model} --cameras {scene} --path turntable --count 200 -o {out}/a.####.png", "/a.0002.png"),

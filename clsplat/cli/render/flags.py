@@ -15,6 +15,7 @@ from clsplat.cli.render.help_page import RENDER_GROUPS
 from clsplat.config.channels import in_words
 from clsplat.config.pictures import (
     DEFAULT_EXR_DEPTH,
+    VIDEO_SUFFIXES,
     ColourConfig,
     Compression,
     DeepConfig,
@@ -179,8 +180,6 @@ class RenderVerb(Verb):
     @property
     def is_video(self) -> bool:
         """True if the output is a video, one file with all frames."""
-        from clsplat.images.frame_files import VIDEO_SUFFIXES
-
         return self.extension in VIDEO_SUFFIXES
 
     @property

@@ -31,7 +31,7 @@ from clsplat.demo.town.photography import Observations, take
 from clsplat.demo.town.settings import TownConfig
 from clsplat.demo.town.textures import textures
 from clsplat.errors import InputError
-from clsplat.files.atomic import atomic_write, move_into_place, temporary_name
+from clsplat.files.atomic import atomic_write, move_into_place, work_folder
 from clsplat.files.documents import is_file
 from clsplat.files.locks import abandoned
 from clsplat.images.writing import write_image
@@ -69,30 +69,26 @@ def write_town(
     """
     config.check()
     check_folder(output, overwrite=overwrite)
-    output.parent.mkdir(parents=True, exist_ok=True)
     for left in abandoned([output]):
         if left.is_dir():
             shutil.rmtree(left, ignore_errors=True)
-    place = Path(os.path.realpath(output))
-    work = temporary_name(place)
     try:
-        result = work / "result"
-        result.mkdir(parents=True)
-        planned = [
-            shot for j in range(config.rows) for i in range(config.columns) for shot in photographs(config, i, j)
-        ]
-        planned.sort(key=lambda shot: shot.name)
-        seen = _take_all(result, config, planned, workers or min(os.cpu_count() or 1, MAX_TOWN_WORKERS), progress)
-        points = _write_model(result, config, planned, seen)
-        record = {"town": config.record(), "photographs": len(planned), "points": points}
-        atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        check_folder(output, overwrite=overwrite)  # another process may have created the folder
-        move_into_place(work, place)
+        with work_folder(output) as work:
+            result = work / "result"
+            result.mkdir()
+            planned = [
+                shot for j in range(config.rows) for i in range(config.columns) for shot in photographs(config, i, j)
+            ]
+            planned.sort(key=lambda shot: shot.name)
+            seen = _take_all(result, config, planned, workers or min(os.cpu_count() or 1, MAX_TOWN_WORKERS), progress)
+            points = _write_model(result, config, planned, seen)
+            record = {"town": config.record(), "photographs": len(planned), "points": points}
+            atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
+            check_folder(output, overwrite=overwrite)  # another process may have created the folder
+            move_into_place((result, output))
     except KeyboardInterrupt as error:
         error.args = ("before the town was complete: no file of it is left, and the same command starts anew",)
         raise
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return record
 
 

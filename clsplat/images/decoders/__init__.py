@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoders of photographs that OpenImageIO's wheel does not read: HEIF, AVIF and raw files."""
+"""Decoders of photographs that OpenImageIO's wheel does not read: HEIF, AVIF and raw files; and ICC profiles."""

@@ -33,12 +33,13 @@ def open_avif_photo(path: Path) -> DecodedPhoto:
     try:
         image: Any = AvifImageFile(whole_file(path))
         (width, height), channels, exif = image.size, image.mode, image.info.get("exif")
+        profile = image.info.get("icc_profile")
         orientation = int(image.getexif().get(_ORIENTATION_TAG, 1))
     except Exception as error:  # noqa: BLE001  # SyntaxError, ValueError, OSError, struct.error and others
         raise undecodable(path, "an AVIF photograph", error) from None
     if orientation >= 5:
         width, height = height, width
-    spec = photo_spec(width, height, channels.replace("L", "Y"), oiio.UINT8, exif)
+    spec = photo_spec(width, height, channels.replace("L", "Y"), oiio.UINT8, exif, profile)
 
     def decode() -> tuple[NDArray[Any], float]:
         pixels = np.asarray(image)

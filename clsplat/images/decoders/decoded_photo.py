@@ -20,6 +20,8 @@ from clsplat.errors import InputError
 
 PHOTOS_EXTRA = "pip install 'clsplat[photos]'"
 """Command that installs the libraries for HEIC, AVIF and raw files."""
+ICC_PROFILE_ATTRIBUTE = "ICCProfile"
+"""OpenImageIO's attribute of a picture with the bytes of its ICC profile."""
 EXIF_ORIENTATION_ATTRIBUTE = "clsplat:ExifOrientation"
 """Attribute of a photograph with the orientation in its EXIF data, which the decoder ignores. Apple's accelerometer has
 the axes of the sensor, so that its reader needs the orientation."""
@@ -94,12 +96,15 @@ class DecodedPhoto:
         """Do nothing: the decoders close their files when they have decoded."""
 
 
-def photo_spec(width: int, height: int, channels: str, form: Any, exif: bytes | None = None) -> Any:
+def photo_spec(
+    width: int, height: int, channels: str, form: Any, exif: bytes | None = None, profile: bytes | None = None
+) -> Any:
     """Return OpenImageIO's specification of a photograph that is upright and has straight alpha.
 
     channels: a letter for each channel, such as "RGBA" or "YA".
     form: OpenImageIO's type of the stored values.
     exif: EXIF data, whose values become attributes. Its orientation becomes EXIF_ORIENTATION_ATTRIBUTE.
+    profile: ICC profile of the colours, for the attribute ICC_PROFILE_ATTRIBUTE.
     """
     spec = oiio.ImageSpec(width, height, len(channels), form)
     spec.channelnames = tuple(channels)
@@ -108,6 +113,8 @@ def photo_spec(width: int, height: int, channels: str, form: Any, exif: bytes | 
         spec.attribute("oiio:UnassociatedAlpha", 1)
     if exif:
         _set_exif(spec, exif)
+    if profile:
+        spec.attribute(ICC_PROFILE_ATTRIBUTE, f"uint8[{len(profile)}]", np.frombuffer(profile, np.uint8))
     return spec
 
 

@@ -32,10 +32,11 @@ def open_heif_photo(path: Path) -> DecodedPhoto:
     try:
         image: Any = pillow_heif.open_heif(whole_file(path), convert_hdr_to_8bit=False, hdr_to_16bit=False)
         (width, height), mode, exif = image.size, image.mode, image.info.get("exif")
+        profile = image.info.get("icc_profile")
         bits, channels = int(image.info["bit_depth"]), _CHANNELS[mode.partition(";")[0]]
     except Exception as error:  # noqa: BLE001  # ValueError, EOFError, SyntaxError, RuntimeError, KeyError, IndexError
         raise undecodable(path, "a HEIC photograph", error) from None
-    spec = photo_spec(width, height, channels, oiio.UINT8 if bits <= 8 else oiio.UINT16, exif)
+    spec = photo_spec(width, height, channels, oiio.UINT8 if bits <= 8 else oiio.UINT16, exif, profile)
     if image.premultiplied_alpha:
         spec.attribute("oiio:UnassociatedAlpha", 0)
 

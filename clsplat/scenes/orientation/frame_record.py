@@ -32,12 +32,16 @@ def read_frame(folder: Path) -> SceneFrame:
         matrix = np.array(document["world_from_source"], np.float64)
         decompose(matrix)
         upright, metres, origin = (document[key] for key in ("upright", "metres", "origin"))
+        measured = tuple(float(value) for value in document.get("measured", ()))  # records may be older
         notes = document["up_note"], document["scale_note"]
         assert isinstance(upright, bool)
         assert isinstance(metres, bool)
         assert len(origin) in (0, 3)
+        assert len(measured) in (0, 7)
+        assert all(abs(value) < np.inf for value in measured)
+        assert all(value > 0 for value in measured[6:])
         assert all(isinstance(note, str) for note in notes)
-        frame = SceneFrame(matrix, upright, metres, tuple(float(value) for value in origin), *notes)
+        frame = SceneFrame(matrix, upright, metres, tuple(float(value) for value in origin), measured, *notes)
     except (ValueError, KeyError, TypeError, AssertionError, InputError) as error:
         raise InputError(
             f"{path}: is damaged ({str(error) or 'its form is wrong'}), expected {_EXPECTED_FRAME_RECORD}; make the "

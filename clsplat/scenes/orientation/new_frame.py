@@ -23,6 +23,9 @@ from clsplat.scenes.orientation.positions import MapFit, fit_map, globe_position
 from clsplat.scenes.orientation.upright import MIN_UPRIGHT_CAMERAS, Upright, up_from_gravity, upright
 from clsplat.scenes.outliers import stray_cameras
 
+SAME_SCALE_TOLERANCE = 1e-9
+"""Relative difference of two scales that counts as rounding, so that the same --scale changes nothing again."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
@@ -112,20 +115,38 @@ def new_frame(
         known = replace(known, upright=True, origin=(), up_note=found.note)
     if (rule := parse_scale(use.scale)) is not None:
         if rule.kind != "gps":
-            factor, note = subject.metres_per_unit(use.scale, rule), f"the known length {use.scale}"
+            unit, note = subject.metres_per_unit(use.scale, rule), f"the known length {use.scale}"
+            factor, known = _to_metres(unit, rule, known)
         else:
             up = found.up if use.orient == "up" else np.array(COLMAP_UP) if frame.upright else subject.upright().up
             fit = subject.fit_map(up) if use.orient != "up" or fit is None else fit
-            factor, note = fit.metres, fit.note
+            factor = unit = fit.metres
+            note = fit.note
             if use.orient == "up":
                 places = {name: factor * moved(one.position, change) for name, one in subject.cameras.items()}
                 known = replace(known, origin=globe_position(fit, subject.positions, places))
         change = scaling(factor) @ change
-        known = replace(known, metres=True, scale_note=f"metres are from {note}: a unit was {factor:.6g} m")
+        if not (frame.metres and factor == 1):
+            known = replace(known, metres=True, scale_note=f"metres are from {note}: a unit was {unit:.6g} m")
     matrix = change @ frame.world_from_source
     if use.orient == "none":  # without rounding errors, so that the axes are exactly the source's
         matrix = scaling(round(decompose(matrix)[0], 12))
     return replace(known, world_from_source=matrix)
+
+
+def _to_metres(unit: float, rule: ScaleRule, frame: SceneFrame) -> tuple[float, SceneFrame]:
+    """Return the factor that brings a frame's units to metres, and the frame with the two points of the rule.
+
+    Points that are given a second time were measured before the scene was scaled, so the factor is for that scale.
+
+    unit: length in metres of the unit in which the rule's points or cameras were measured.
+    """
+    now = decompose(frame.world_from_source)[0]
+    then = frame.measured[6] if rule.kind == "points" and frame.measured[:6] == rule.ends else now
+    factor = unit * then / now
+    if rule.kind == "points":
+        frame = replace(frame, measured=(*rule.ends, then))
+    return (1.0 if abs(factor - 1) < SAME_SCALE_TOLERANCE else factor), frame
 
 
 def _cameras(data: DataSet) -> dict[str, Camera]:

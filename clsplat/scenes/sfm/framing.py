@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from pathlib import Path
 
 from clsplat.config.orientation import FrameUse, Orient
 from clsplat.errors import InputError, warn
-from clsplat.files.atomic import atomic_write, move_into_place
+from clsplat.files.atomic import atomic_write, move_into_place, work_folder
 from clsplat.files.documents import is_file
 from clsplat.scenes.dataset import SceneFrame
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
@@ -76,13 +75,10 @@ def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneF
 
     model = pycolmap.Reconstruction(folder)
     model.transform(pycolmap.Sim3d(change[:3]))
-    work = Path(tempfile.mkdtemp(prefix=".frame-", dir=scene))
-    try:
+    with work_folder(folder) as work:
         made = work / "result"
         shutil.copytree(folder, made, ignore=shutil.ignore_patterns(FRAME_RECORD_FILE))
         model.write(made)
         atomic_write(made / FRAME_RECORD_FILE, frame.content())
-        move_into_place(work, folder)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        move_into_place((made, folder))
     return frame

@@ -17,10 +17,11 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, InputError, examples
 from clsplat.files.atomic import require_room, room_error, write_error
 from clsplat.files.documents import is_file
 from clsplat.files.names import ON_WINDOWS, native_name
+from clsplat.images.decoders.colour_profiles import SrgbPhoto
 from clsplat.images.decoders.decoded_photo import PHOTOS_EXTRA
 from clsplat.images.decoders.orientation import turned
 from clsplat.images.decoders.photo_decoders import (
@@ -30,8 +31,9 @@ from clsplat.images.decoders.photo_decoders import (
     without_converted,
 )
 from clsplat.images.exif import lens_of
-from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_photograph, opened
+from clsplat.images.reading import alpha_of, companions, error_of, open_photograph, opened
 from clsplat.images.writing import jpeg_room
+from clsplat.scenes.sfm.captured_files import captured_files
 from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 
 SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -42,6 +44,8 @@ SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
 """OpenImageIO's names of the formats that pycolmap's wheel reads. The format is recognised by the file's contents."""
 UNREADABLE_PHOTO_EXTENSIONS = frozenset({".jp2", ".jxl", ".gif", ".exr"})
 """Extensions of photographs that structure from motion does not use. A warning asks for conversion."""
+MADE_BY_CLSPLAT = "made by clsplat from a video or photos; to use such pictures, give only their folder"
+"""Why folders of frames and results of structure from motion are left out of a search, for messages."""
 
 
 @dataclass(frozen=True)
@@ -70,26 +74,24 @@ def find_photos(
 ) -> tuple[list[Path], dict[str, list[Path]]]:
     """Return the photographs below a folder, sorted by name, and the files that are left out, keyed by the reason.
 
-    Hidden files and folders are skipped, as are the folders `excluded` (outputs, if they are inside). Raises InputError
-    for a folder that does not exist or cannot be read, and for a photograph whose name has unprintable characters.
+    The search is that of `captured_files`. Raises InputError for a folder that does not exist or cannot be read, and
+    for a photograph whose name has unprintable characters.
+
+    excluded: folders to skip, such as outputs inside the folder.
 
     needed: True to raise InputError if there are no photographs.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a folder with photos")
-    skip = {path.resolve() for path in excluded}
     photos: list[Path] = []
     others: list[Path] = []
     lacking: list[Path] = []
     broken: list[Path] = []
     known = SFM_PHOTO_EXTENSIONS | CONVERTED_PHOTO_EXTENSIONS
-    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
-        here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
-        for name in files:
+    searched = captured_files(folder, excluded)
+    for here, names in searched.folders:
+        for name in names:
             extension = Path(name).suffix.lower()
-            if name.startswith("."):
-                continue
             if extension in known and not name.isprintable():
                 raise InputError(f"{here / name}: its name has unprintable characters; rename it")
             if extension in known and (here / name).is_symlink() and not (here / name).exists():
@@ -107,6 +109,11 @@ def find_photos(
             raise InputError(f"{folder}: has only {found}, and reading them needs another package: {PHOTOS_EXTRA}")
         unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
         unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
+        unusable += (
+            f", only in {examples(sorted(photo_name(folder, path) for path in searched.made))}, {MADE_BY_CLSPLAT}"
+            if searched.made
+            else ""
+        )
         raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
     converted = set(without_converted([*photos, *lacking])[1])
@@ -117,6 +124,7 @@ def find_photos(
     aside = companions(photos, photos, folder)
     kept = [path for path in photos if path not in aside]
     left_out = {
+        MADE_BY_CLSPLAT: searched.made,
         f"reading them needs another package: {PHOTOS_EXTRA}": [path for path in lacking if path not in converted],
         "their folder has the same photos in another format": list(converted),
         "convert to JPEG, PNG or TIFF first": others,
@@ -150,10 +158,11 @@ def stage_photos(
 ) -> list[Photo]:
     """Put a copy of every photograph, or a link to it, under `target`, and decode it once. Returns the photographs.
 
-    pycolmap ignores the EXIF orientation and cannot read some formats. So photographs with an orientation, or in such a
-    format, are rewritten upright, with the EXIF data from which pycolmap takes focal lengths and GPS positions. Other
-    files are linked, or copied if the file system has no links. Raises InputError that names the first photograph that
-    does not decode, as pycolmap would silently skip it.
+    pycolmap ignores the EXIF orientation and ICC profiles, and cannot read some formats. So photographs with an
+    orientation, in Display P3 or Adobe RGB, or in such a format, are rewritten upright and in sRGB. The copies have the
+    EXIF data from which pycolmap takes focal lengths and GPS positions. Other files are linked, or copied if the file
+    system has no links. Raises InputError that names the first photograph that does not decode, as pycolmap would
+    silently skip it.
 
     report: function that is called with the fraction of the photographs that are done.
     """
@@ -193,10 +202,11 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
     copy.parent.mkdir(parents=True, exist_ok=True)
     orientation = spec.get_int_attribute("Orientation", 1)
     width, height = spec.width, spec.height
-    if orientation in range(2, 9) or kind not in SFM_IMAGE_FORMATS:
+    decoded = kind in PHOTO_DECODERS or isinstance(source, SrgbPhoto)
+    if orientation in range(2, 9) or kind not in SFM_IMAGE_FORMATS or decoded:
         if orientation in range(5, 9):
             width, height = height, width
-        _write_upright(path, copy, spec, pixels if kind in PHOTO_DECODERS else None)
+        _write_upright(path, copy, spec, pixels if decoded else None)
     else:
         try:
             if ON_WINDOWS and not os.access(path, os.W_OK):

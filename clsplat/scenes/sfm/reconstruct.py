@@ -8,13 +8,12 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 from clsplat.config.masks import MaskUse
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.atomic import move_into_place
+from clsplat.files.atomic import move_into_place, work_folder
 from clsplat.files.documents import is_file
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
@@ -22,6 +21,7 @@ from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
 from clsplat.scenes.sfm.framing import scale_new, set_frame, turn_new
 from clsplat.scenes.sfm.pipeline.photo_pairs import SFM_MATCHINGS
 from clsplat.scenes.sfm.video_frames import VideoFrames, frames_of_videos
@@ -34,8 +34,6 @@ Mapper = Literal["auto", "global", "incremental"]
 Features = Literal["sift", "aliked"]
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"]
 
-SFM_RECORD_FILE = "sfm.json"
-"""File in the result that records its photographs and settings, the photographs without a pose, and its quality."""
 MIN_SFM_PHOTOS = 3
 """Minimum number of photographs of a reconstruction."""
 SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
@@ -137,35 +135,33 @@ def reconstruct(
     Warns of copies, of which one is used, of photographs without a pose, in an unreadable format or without their
     alpha, and of focal lengths that differ from EXIF's. Raises InputError for a folder without photographs, a
     photograph that does not decode, an output that must not be replaced, and if the cameras cannot be recovered.
-    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for all frames of videos.
+    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for all frames of videos. If
+    earlier frames are to be replaced, they and an earlier result stay whole until the new result is complete.
     """
     report = progress or no_progress
     settings.check()
-    videos = frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to)
-    paths, copies, left_out = _files(images, output, videos)
-    mask_files = _masks(images, paths, masks)
-    settings = _with_weights(settings)
-    asked = f"{settings}{_described(masks, mask_files)}{_identity(settings.weights)}{videos.fingerprint}"
-    fingerprint = sfm_photos.fingerprint(images, paths, asked)
-    if _is_finished(output, images, fingerprint, overwrite=overwrite):
-        report("using the cameras recovered before", 1.0)
-        set_frame(output, images, settings.frame, output)
-        return output
-    _require_enough(images, len(paths) + len(videos.paths))
-    _warn_of_left_out(images, left_out)
-    workers = threads or os.cpu_count() or 1
-    output.parent.mkdir(parents=True, exist_ok=True)
-    # Work in the output's parent folder, so that the last step is a rename within one file system.
-    with TemporaryDirectory(prefix=f".{output.name}-sfm-", dir=output.parent, ignore_cleanup_errors=True) as folder:
-        work = Path(folder)
-        photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
-        masked = _staged_masks(photos, mask_files, masks, work)
-        task = sfm_task(settings, photos, masked, videos.sequences, work, workers)
-        result = _recovered(images, len(photos), run_worker(task, work, report))
-        turn_new(work / "result", images, settings.frame, images)
-        _write_record(work / "result", fingerprint, photos, result)
-        _warn_of_losses(images, photos, result, work / "result" / "images", masks)
-        move_into_place(work, output)
+    with frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to) as videos:
+        paths, copies, left_out = _files(images, output, videos)
+        mask_files = _masks(images, paths, masks, videos)
+        settings = _with_weights(settings)
+        asked = f"{settings}{_described(masks, mask_files)}{_identity(settings.weights)}{videos.fingerprint}"
+        fingerprint = sfm_photos.fingerprint(images, paths, asked)
+        if _is_finished(output, images, fingerprint, overwrite=overwrite):
+            report("using the cameras recovered before", 1.0)
+            set_frame(output, images, settings.frame, output)
+            return output
+        _require_enough(images, len(paths) + len(videos.paths))
+        _warn_of_left_out(images, left_out)
+        workers = threads or os.cpu_count() or 1
+        with work_folder(output) as work:
+            photos = _staged_photos(images, paths, copies, videos, work / "photos", report, workers)
+            masked = _staged_masks(photos, mask_files, masks, work)
+            task = sfm_task(settings, photos, masked, videos.sequences, work, workers)
+            result = _recovered(images, len(photos), run_worker(task, work, report))
+            turn_new(work / "result", images, settings.frame, images)
+            _write_record(work / "result", fingerprint, photos, result)
+            _warn_of_losses(images, photos, result, work / "result" / "images", masks)
+            move_into_place(*videos.moves, (work / "result", output))
     scale_new(output, images, settings.frame)
     return output
 
@@ -180,10 +176,10 @@ def _files(
 
 
 def _warn_of_left_out(images: Path, left_out: dict[str, list[Path]]) -> None:
-    """Warn of photographs and videos that are left out. left_out: lists of files, keyed by the reason."""
+    """Warn of photographs, videos and folders that are left out. left_out: lists of files, keyed by the reason."""
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
-        kind = "video(s)" if all(map(is_video_name, others)) else "photo(s)"
+        kind = "folder(s)" if others[0].is_dir() else "video(s)" if all(map(is_video_name, others)) else "photo(s)"
         warn(f"{images}: {_listed(names, kind)} left out: {why}")
 
 
@@ -349,19 +345,24 @@ def _require_enough(images: Path, count: int) -> None:
         raise InputError(f"{images}: only {count} photo(s) found, expected at least {MIN_SFM_PHOTOS}")
 
 
-def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
-    """Find the masks of the photographs, by the photographs' names.
+def _masks(images: Path, paths: list[Path], use: MaskUse | None, videos: VideoFrames) -> dict[str, Path]:
+    """Find the masks of the photographs and of the videos' frames, by the photographs' and frames' names.
 
-    Raises InputError if masks are requested but missing, or if a mask fits no photograph.
+    Raises InputError if masks are requested but missing. Also raises it if a mask fits no photograph or frame, unless
+    there are both, whose masks may be in one folder.
     """
     if use is None or use.masks == "none":
         return {}
     photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
-    found = masks_beside(photos, others=OTHER_MASK_FOLDERS)
+    frames = [_FoundPhoto(name, videos.folder / name) for name in videos.names]
+    found: dict[str, Path] = {}
+    for pictures in (photos, frames):
+        if pictures:
+            found |= masks_beside(pictures, strict=not (photos and frames), others=OTHER_MASK_FOLDERS)
     if not found:
-        raise InputError(
-            f"{images}: has no masks, expected masks/IMAGE.jpg.png next to the photos' folder or inside it"
-        )
+        where = f"{videos.folder}, its folder of frames," if frames else "the photos' folder"
+        name = frames[0].name if frames else "IMAGE.jpg"
+        raise InputError(f"{images}: has no masks, expected masks/{name}.png in {where} or next to it")
     warn_of_sense(found.values(), use, images)
     return found
 

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from clsplat.errors import InputError
 from clsplat.files.documents import digest
-from clsplat.images.reading import cannot_be_searched
 from clsplat.images.video import video_missing
 from clsplat.progress import Progress
+from clsplat.scenes.sfm.captured_files import captured_files
 from clsplat.scenes.sfm.photos import (
     CONVERTED_PHOTO_EXTENSIONS,
     SFM_PHOTO_EXTENSIONS,
@@ -22,7 +22,7 @@ from clsplat.scenes.sfm.photos import (
     photo_name,
     stage_photos,
 )
-from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, take_frames
+from clsplat.scenes.video.frames import FRAME_TABLE_FILE, frame_sequences, taking_frames
 from clsplat.scenes.video.reading import VIDEO_INPUT_SUFFIXES, is_video_name
 
 RECONSTRUCTION_SUFFIX, FRAMES_SUFFIX = "_colmap", "_frames"
@@ -47,6 +47,7 @@ class VideoFrames:
     """Frames of the videos in a folder of photographs; none if there are no videos.
 
     folder: folder of the frames.
+    made: hidden folder of new frames, which are to replace those in `folder`; None if they are in `folder`.
     paths: the frames' files, sorted by name.
     sequences: names of the frames of each video, in display order. If a folder of frames was given in place of
         photographs, they are the names of its frames.
@@ -54,6 +55,7 @@ class VideoFrames:
     """
 
     folder: Path
+    made: Path | None = None
     paths: list[Path] = field(default_factory=list)
     sequences: list[list[str]] = field(default_factory=list)
     left_out: dict[str, list[Path]] = field(default_factory=dict)
@@ -64,7 +66,17 @@ class VideoFrames:
 
         The table has digests of the videos. It stays the same if the frames are taken anew, at another time.
         """
-        return digest(self.folder / FRAME_TABLE_FILE) if self.paths else ""
+        return digest((self.made or self.folder) / FRAME_TABLE_FILE) if self.paths else ""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the videos' frames: their paths below the folder of the frames."""
+        return [photo_name(self.made or self.folder, path) for path in self.paths]
+
+    @property
+    def moves(self) -> list[tuple[Path, Path]]:
+        """The move of new frames in place of earlier ones, for `move_into_place`; empty if there is none."""
+        return [] if self.made is None else [(self.made, self.folder)]
 
     def photos_beside(self, images: Path, output: Path) -> tuple[list[Path], dict[str, list[Path]]]:
         """Return the photographs beside the videos, and the files that are left out, as `find_photos` does."""
@@ -77,7 +89,7 @@ class VideoFrames:
         """Put the frames under `target`, as `stage_photos` does. Frames of one video share its camera."""
         if not self.paths:
             return []
-        return self.by_video(stage_photos(self.folder, self.paths, target, report, threads))
+        return self.by_video(stage_photos(self.made or self.folder, self.paths, target, report, threads))
 
     def by_video(self, photos: list[Photo]) -> list[Photo]:
         """Add the number of its video to the `lens` of each frame, so that only frames of one video share a camera.
@@ -91,6 +103,7 @@ class VideoFrames:
         ]
 
 
+@contextmanager
 def frames_of_videos(
     images: Path,
     output: Path,
@@ -99,13 +112,15 @@ def frames_of_videos(
     *,
     overwrite: bool = False,
     folder: Path | None = None,
-) -> VideoFrames:
-    """Take the frames of a video, or of all videos below a folder of photographs.
+) -> Iterator[VideoFrames]:
+    """Context manager that takes the frames of a video, or of all videos below a folder of photographs.
 
-    output: folder for the cameras. count, overwrite: as for `take_frames`.
+    Earlier frames are replaced at the end of the block, as by `taking_frames`.
+
+    output: folder for the cameras. count, overwrite: as for `taking_frames`.
     folder: folder for the frames; by default `frames_folder(output)`.
     Without PyAV, videos beside photographs are left out, unless frames are asked for by `count`.
-    Raises InputError for a file that is not a video, for a `count` without videos, and if `take_frames` does.
+    Raises InputError for a file that is not a video, for a `count` without videos, and if `taking_frames` does.
     """
     folder = folder or frames_folder(output)
     videos = [images]
@@ -121,38 +136,32 @@ def frames_of_videos(
     if not videos:
         if count is not None:
             raise InputError(f"--frames {count}: {images} has no videos, expected one")
-        return VideoFrames(folder, sequences=frame_sequences(images), left_out=parts)
+        yield VideoFrames(folder, sequences=frame_sequences(images), left_out=parts)
+        return
     why = video_missing() if count is None and images.is_dir() else ""
     if why and find_photos(images, (output, folder), needed=False)[0]:
-        return VideoFrames(folder, left_out={**parts, why: videos})
-    taken = take_frames(
-        videos,
-        folder,
-        root=images if images.is_dir() else images.parent,
-        count=count,
-        overwrite=overwrite,
-        progress=progress,
-    )
-    sequences = [list(video.names) for video in taken.videos]
-    return VideoFrames(folder, [folder / name for name in taken.names], sequences, parts)
+        yield VideoFrames(folder, left_out={**parts, why: videos})
+        return
+    root = images if images.is_dir() else images.parent
+    with taking_frames(videos, folder, root=root, count=count, overwrite=overwrite, progress=progress) as taken:
+        paths = [taken.folder / name for name in taken.names]
+        sequences = [list(video.names) for video in taken.videos]
+        yield VideoFrames(folder, taken.folder if taken.pending else None, paths, sequences, parts)
 
 
 def find_videos(folder: Path, excluded: Collection[Path] = ()) -> tuple[list[Path], dict[str, list[Path]]]:
     """Return the videos below a folder, sorted by name, and the videos that are left out, keyed by the reason.
 
     A video with the name of a photograph in the same folder is left out, as phones write such videos with their moving
-    photographs. Hidden files and folders, and the folders `excluded`, are skipped.
+    photographs. The search is that of `captured_files`, which skips the folders `excluded`.
     """
-    skip = {path.resolve() for path in excluded}
     videos: list[Path] = []
     moving: list[Path] = []
-    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
-        here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() not in skip]
+    for here, files in captured_files(folder, excluded).folders:
         kinds = SFM_PHOTO_EXTENSIONS | CONVERTED_PHOTO_EXTENSIONS | UNREADABLE_PHOTO_EXTENSIONS
         stills = {Path(name).stem.casefold() for name in files if Path(name).suffix.lower() in kinds}
         for name in files:
-            if not name.startswith(".") and is_video_name(Path(name)):
+            if is_video_name(Path(name)):
                 if not name.isprintable():
                     raise InputError(f"{here / name}: its name has unprintable characters; rename it")
                 (moving if Path(name).stem.casefold() in stills else videos).append(here / name)

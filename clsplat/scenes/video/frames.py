@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import tempfile
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,9 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.atomic import atomic_write, move_into_place
+from clsplat.files.atomic import atomic_write, move_into_place, work_folder
 from clsplat.files.documents import is_file, known_digest
+from clsplat.images.reading import find_images
 from clsplat.images.writing import write_spec
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
@@ -58,10 +58,14 @@ class FramesOfVideo:
 
 @dataclass(frozen=True)
 class TakenFrames:
-    """The folder of the frames, with FRAME_TABLE_FILE in it, and the frames of each video."""
+    """The folder of the frames, with FRAME_TABLE_FILE in it, and the frames of each video.
+
+    pending: True if the folder is hidden, as in `taking_frames`, and has yet to replace earlier frames.
+    """
 
     folder: Path
     videos: tuple[FramesOfVideo, ...]
+    pending: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -82,8 +86,8 @@ def take_frames(
 
     A frame's name is that of its video's file, followed by the number of the frame: walk.mp4/000123.jpg. The frames are
     upright, with the colours of photographs (`display_rgb`). The same videos give the same bytes again, and the
-    modification times of the videos. An existing folder with the frames of the same videos and the same `count` is used
-    again.
+    modification times of the videos. An existing folder with frames of the same videos is used again if it was made
+    with the same `count`, or if `count` is None.
 
     Each video is decoded twice: once for the choice, which depends on the whole video, and once for the chosen frames.
 
@@ -94,7 +98,27 @@ def take_frames(
 
     Warns of captures that are too fast, too dark, not sharp or without parallax, and of videos that are cut off. Raises
     InputError for a file that is not a video or shows nothing, and for an output that must not be replaced. After
-    KeyboardInterrupt no files remain.
+    KeyboardInterrupt no files remain, and frames that were to be replaced are whole.
+    """
+    with taking_frames(videos, output, root=root, count=count, overwrite=overwrite, progress=progress) as taken:
+        pass
+    return replace(taken, folder=output, pending=False)
+
+
+@contextmanager
+def taking_frames(
+    videos: Sequence[Path],
+    output: Path,
+    *,
+    root: Path | None,
+    count: int | None,
+    overwrite: bool,
+    progress: Progress,
+) -> Iterator[TakenFrames]:
+    """Context manager that takes frames like `take_frames`, and replaces earlier frames only at the end of the block.
+
+    Until then the new frames are in a hidden folder beside `output`. The block may call `move_into_place` for them
+    itself, together with its own result. If it raises an exception, also KeyboardInterrupt, earlier frames stay.
     """
     if count is not None and count < 1:
         raise InputError(f"{count} frames of a video were asked for, expected at least 1")
@@ -103,22 +127,25 @@ def take_frames(
     wanted: list[dict[str, Any]] = [
         {"video": name, "sha256": _digest_of(path), "asked": count} for name, path in zip(names, videos, strict=True)
     ]
-    if (taken := _taken_before(output, wanted, overwrite=overwrite)) is not None:
+    if (taken := _taken_before(output, wanted, any_count=count is None, overwrite=overwrite)) is not None:
         progress("using the frames taken before", 1.0)
-        return taken
-    output.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    try:
+        yield taken
+        return
+    with work_folder(output) as work:
+        made = work / "result"
         rows = [
-            {**row, **_frames_of(path, row["video"], work / "result", count, progress)}
+            {**row, **_frames_of(path, row["video"], made, count, progress)}
             for row, path in zip(wanted, videos, strict=True)
         ]
         table = {"version": FRAME_TABLE_VERSION, "videos": rows}
-        atomic_write(work / "result" / FRAME_TABLE_FILE, (json.dumps(table, indent=1) + "\n").encode())
-        move_into_place(work, output)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-    return _from_table(output, table)
+        atomic_write(made / FRAME_TABLE_FILE, (json.dumps(table, indent=1) + "\n").encode())
+        if is_file(output / FRAME_TABLE_FILE):
+            yield replace(_from_table(made, table), pending=True)
+            if made.exists():
+                move_into_place((made, output))
+            return
+        move_into_place((made, output))
+    yield _from_table(output, table)
 
 
 def frame_sequences(folder: Path) -> list[list[str]]:
@@ -174,10 +201,13 @@ def _from_table(folder: Path, table: dict[str, Any]) -> TakenFrames:
     return TakenFrames(folder, tuple(videos))
 
 
-def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool) -> TakenFrames | None:
+def _taken_before(
+    output: Path, wanted: list[dict[str, Any]], *, any_count: bool, overwrite: bool
+) -> TakenFrames | None:
     """Return the frames in the output if they are of the same videos and counts; None if frames have to be taken.
 
     wanted: name, SHA-256 and number of frames of each video, as in the table.
+    any_count: accept any number of frames of the same videos.
     Raises InputError for an output with anything else, unless it holds frames and `overwrite` is True.
     """
     if not output.exists():
@@ -189,14 +219,17 @@ def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool
             raise InputError(f"{output}: is neither empty nor a folder of a video's frames, expected a new folder")
         return None
     table = _table(output)
-    keys = ("video", "sha256", "asked")
-    same = [{key: row.get(key) for key in keys} for row in table["videos"]] == wanted
+    keys = ("video", "sha256") if any_count else ("video", "sha256", "asked")
+    have, need = ([{key: row.get(key) for key in keys} for row in rows] for rows in (table["videos"], wanted))
+    same = have == need
     sizes = {frame["name"]: frame.get("bytes") for row in table["videos"] for frame in row["frames"]}
     changed = sorted(name for name, size in sizes.items() if _size(output / name) != size)
     if same and not changed and table.get("version") == FRAME_TABLE_VERSION:
         return _from_table(output, table)
     if not overwrite:
         why = "has frames of other videos, or another number of frames"
+        if not any_count:
+            why += " (without --frames, frames of the same videos are used as they are)"
         if same:
             why = (
                 f"{examples(changed)} were removed or changed" if changed else "was made by another version of clsplat"
@@ -204,6 +237,12 @@ def _taken_before(output: Path, wanted: list[dict[str, Any]], *, overwrite: bool
         raise InputError(
             f"{output}: {why}; give this folder in place of the video, remove it, or give --overwrite to clsplat sfm "
             "or capture"
+        )
+    taken = {output / name for name in sizes}
+    if others := [path.relative_to(output).as_posix() for path in find_images(output) if path not in taken]:
+        raise InputError(
+            f"{output}: has pictures beside its frames ({examples(others)}), which would be removed; move them to "
+            "another folder to replace the frames"
         )
     return None
 

@@ -30,7 +30,7 @@ from clsplat.files.mounts import NetworkRate
 from clsplat.images.decoders.photo_decoders import decoder_versions
 from clsplat.version import package_version
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SUFFIX = ".pixels"
 KEY_BYTES = 32
 _MAGIC = b"clsplat\x00"
