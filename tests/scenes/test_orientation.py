@@ -16,7 +16,7 @@ from clsplat.config.orientation import FrameUse, ScaleRule, parse_scale
 from clsplat.images.geotags import GpsPosition
 from clsplat.models.edit import moved, scaling, transform_camera
 from clsplat.scenes.orientation.known_length import metres_per_unit
-from clsplat.scenes.orientation.level import COLMAP_UP
+from clsplat.scenes.orientation.level import COLMAP_UP, median_roll, up_axis
 from clsplat.scenes.orientation.plane import MIN_PLANE_POINTS, ground_height, level_plane
 from clsplat.scenes.orientation.positions import fit_map, globe_position, up_from_gps
 from clsplat.scenes.orientation.upright import looks_down, up_from_gravity, upright
@@ -82,15 +82,35 @@ def test_a_scene_with_a_floor_stands_on_it_in_the_middle() -> None:
     assert np.linalg.det(change[:3, :3]) > 0
 
 
-def test_rolled_cameras_yield_to_the_plane_but_not_to_a_slope() -> None:
-    """A plane decides within 15 degrees of the cameras' up direction. A ramp of 30 degrees is no floor."""
-    points = floor_and_things()[:2000]
-    for degrees, expected in ((12.0, "level plane"), (30.0, "no plane")):
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
-        found = upright(ring(), moved(points, turn))
-        assert expected in found.note
-        assert angle(found.up, UP) == pytest.approx(degrees if expected == "level plane" else 0.0, abs=0.1)
+@pytest.mark.parametrize(
+    ("rolls", "degrees", "decides"),
+    [(0.0, 2.0, True), (0.0, 4.0, False), (6.0, 6.0, True), (6.0, 12.0, False), (20.0, 12.0, True), (20.0, 30, False)],
+)
+def test_rolled_cameras_yield_to_the_plane_but_not_to_a_slope(rolls: float, degrees: float, decides: bool) -> None:
+    """A plane decides within twice the median roll of the cameras, or within 3 degrees, but not beyond 15 degrees.
+
+    A slope beneath cameras that are held level is no floor. The median roll of these cameras is 0.6 times `rolls`.
+    """
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    cameras = ring(rolls)
+    found = upright(cameras, moved(floor_and_things()[:2000], turn))
+    assert ("level plane" if decides else "no plane") in found.note
+    if decides:
+        assert angle(found.up, UP) == pytest.approx(degrees, abs=0.1)
+    else:
+        assert angle(found.up, up_axis(cameras)) < 1e-6
+
+
+def test_cameras_on_one_side_do_not_tell_how_level_they_are_held() -> None:
+    """They may all look down by the same angle, so that the plane decides."""
+    places = np.stack([np.linspace(-1, 1, 9), np.full(9, -1.5), np.full(9, -4.0)], axis=1)
+    down = np.array([0.0, np.sin(np.deg2rad(12)), np.cos(np.deg2rad(12))])
+    cameras = [camera_at(place, place + down) for place in places]
+    assert median_roll(cameras) is None
+    found = upright(cameras, floor_and_things()[:2000])
+    assert "level plane" in found.note
+    assert angle(found.up, UP) < 0.1
 
 
 def test_a_wall_without_a_floor_leaves_up_to_the_cameras() -> None:

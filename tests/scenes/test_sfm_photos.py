@@ -41,4 +41,5 @@ def test_camera_groups():
 def test_settings_of_earlier_versions_keep_their_text():
     """Otherwise `sfm` and `train` would refuse the cameras that an earlier version has recovered."""
     assert str(SfmSettings()) == "auto auto auto 1600 8192 0"
+    assert str(SfmSettings(max_features=8192)) != str(SfmSettings())
     assert str(SfmSettings(mapper="global")) != str(SfmSettings()) != str(SfmSettings(features="aliked"))

@@ -13,6 +13,10 @@ from clsplat.camera import Camera
 COLMAP_UP = (0.0, -1.0, 0.0)
 """Up axis of a world that has the axes of a level camera, whose y axis points down in COLMAP's convention."""
 
+MIN_RIGHT_SPREAD = 0.05
+"""Minimum mean square of the cameras' x axes along the second of their principal axes, at which they span a plane. It
+is 0.5 for cameras all around."""
+
 
 def up_axis(cameras: Sequence[Camera]) -> Float64:
     """Estimate the world's up direction, a unit vector (3,), from how the photographers held their cameras.
@@ -25,10 +29,21 @@ def up_axis(cameras: Sequence[Camera]) -> Float64:
     mean_up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     spread, axes = np.linalg.eigh(right.T @ right / len(cameras))
     up: Float64 = axes[:, 0]
-    if spread[1] < 0.05 or abs(up @ mean_up) < 0.2 * np.linalg.norm(mean_up):
+    if spread[1] < MIN_RIGHT_SPREAD or abs(up @ mean_up) < 0.2 * np.linalg.norm(mean_up):
         up = mean_up if np.linalg.norm(mean_up) > 1e-6 else -cameras[0].rotation[1]
     up = up / np.linalg.norm(up)
     return up if up @ mean_up >= 0 else -up
+
+
+def median_roll(cameras: Sequence[Camera]) -> float | None:
+    """Return the median angle of the cameras' x axes from level in radians, for up as from `up_axis`.
+
+    Returns None if all photographs are from one side, so that their tilts up and down decide up, too.
+    """
+    right = np.stack([camera.rotation[0] for camera in cameras])
+    if np.linalg.eigvalsh(right.T @ right / len(cameras))[1] < MIN_RIGHT_SPREAD:
+        return None
+    return float(np.median(np.abs(np.arcsin(np.clip(right @ up_axis(cameras), -1, 1)))))
 
 
 def focus_point(cameras: Sequence[Camera]) -> Float64:

@@ -15,13 +15,16 @@ import numpy as np
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.scenes.orientation.level import focus_point, up_axis
+from clsplat.scenes.orientation.level import focus_point, median_roll, up_axis
 from clsplat.scenes.orientation.plane import LevelPlane, ground_height, in_reach, level_plane
 
 MIN_UPRIGHT_CAMERAS = 3
 """Minimum number of cameras for an upright frame."""
 MAX_PLANE_TILT_RADIANS = np.deg2rad(15.0)
 """Largest angle between a level plane and the cameras' up direction. People hold cameras level to a few degrees."""
+MIN_PLANE_TILT_RADIANS, PLANE_TILT_ROLLS = np.deg2rad(3.0), 2.0
+"""If the cameras are held level, the largest angle is smaller: PLANE_TILT_ROLLS times their median roll, but at least
+MIN_PLANE_TILT_RADIANS. A plane that is farther from the up direction on which the cameras agree is not level."""
 MAX_PLANE_TILT_BELOW_RADIANS = np.deg2rad(30.0)
 """The same limit if all cameras look down. Their up direction is less exact, as only their view directions give it."""
 MIN_SAME_VIEW = 0.9
@@ -137,7 +140,11 @@ def _prior(cameras: Sequence[Camera]) -> tuple[Float64, float, str]:
     if looks_down(cameras):
         forward = np.mean([camera.rotation[2] for camera in cameras], axis=0)
         return -forward / np.linalg.norm(forward), MAX_PLANE_TILT_BELOW_RADIANS, "the cameras, which all look down"
-    return up_axis(cameras), MAX_PLANE_TILT_RADIANS, "the cameras' up direction"
+    up, roll = up_axis(cameras), median_roll(cameras)
+    limit = MAX_PLANE_TILT_RADIANS
+    if roll is not None:
+        limit = float(np.clip(PLANE_TILT_ROLLS * roll, MIN_PLANE_TILT_RADIANS, MAX_PLANE_TILT_RADIANS))
+    return up, limit, "the cameras' up direction"
 
 
 def looks_down(cameras: Sequence[Camera]) -> bool:

@@ -43,6 +43,9 @@ SFM_MAPPERS: tuple[str, ...] = get_args(Mapper)
 """Choices of `SfmSettings.mapper`."""
 SFM_FEATURES: tuple[str, ...] = get_args(Features)
 """Choices of `SfmSettings.features`."""
+MAX_SFM_FEATURES, EARLIER_MAX_SFM_FEATURES = 4096, 8192
+"""Maximum number of features in a photograph by default, in this version and in those before it. The time of matching a
+pair grows with its square."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class SfmSettings:
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
-    max_features: maximum number of features in a photograph.
+    max_features: maximum number of features in a photograph, of which the largest are kept.
     mapper: "incremental" adds one photograph after another. "global" solves for all cameras at once. "auto" is
         "incremental", and also "global" if "incremental" places less than 60 % of the photographs.
     features: "sift", or "aliked", learned features.
@@ -71,7 +74,7 @@ class SfmSettings:
     camera_model: str = "auto"
     shared_camera: bool | Literal["auto"] = "auto"
     max_image_size: int = 1600
-    max_features: int = 8192
+    max_features: int = MAX_SFM_FEATURES
     seed: int = 0
     mapper: Mapper = "auto"
     features: Features = "sift"
@@ -95,12 +98,16 @@ class SfmSettings:
     def __str__(self) -> str:
         """Return the values of the settings in one line, for the fingerprint of a result.
 
-        Mapper and features are left out by default, so that results of versions without these choices are reused.
+        Mapper and features are left out by default, so that results of versions without these choices are reused. The
+        default number of features is that of these versions, and another number is marked.
         """
         lens = f"{self.camera_model} {self.shared_camera}"
         chosen = (self.mapper, self.features)
         more = "" if chosen == ("auto", "sift") else f" {self.mapper} {self.features}"
-        return f"{self.matching} {lens} {self.max_image_size} {self.max_features} {self.seed}{more}"
+        most = f"={self.max_features}"
+        if self.max_features == MAX_SFM_FEATURES:
+            most = f"{EARLIER_MAX_SFM_FEATURES}"
+        return f"{self.matching} {lens} {self.max_image_size} {most} {self.seed}{more}"
 
 
 DEFAULT_SFM_SETTINGS = SfmSettings()

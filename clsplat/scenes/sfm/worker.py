@@ -24,7 +24,7 @@ import pycolmap
 
 from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm.pipeline import aliked, mapping, matching
-from clsplat.scenes.sfm.pipeline.database import feature_evidence, renumber_by_name
+from clsplat.scenes.sfm.pipeline.database import feature_evidence, keep_largest, renumber_by_name
 from clsplat.scenes.sfm.pipeline.features import extract_sift
 from clsplat.scenes.sfm.worker_progress import UNDISTORTED_IMAGES
 
@@ -131,6 +131,7 @@ class Worker:
         else:
             self.begin("features", self.count)
             extract_sift(self.database, self.task)
+            keep_largest(self.database, self.task["max_features"])
         renumber_by_name(self.database)
 
     def match(self) -> tuple[str, int]:

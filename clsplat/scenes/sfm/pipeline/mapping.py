@@ -36,6 +36,8 @@ def incremental_models(
     options.min_model_size = MIN_MODEL_PHOTOS
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_GROWTH
     options.ba_global_max_refinements, options.ba_local_max_refinements = GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS
+    # Poses are adjusted with enough points to cover every photograph, then the other points with these poses.
+    options.mapper.ba_global_ignore_redundant_points3D = True
     if relaxed:
         options.mapper.init_min_tri_angle = 4.0
         options.mapper.init_max_forward_motion = 1.0
