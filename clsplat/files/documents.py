@@ -16,7 +16,12 @@ from typing import Any, BinaryIO
 from clsplat.errors import InputError, WriteError, reason_of
 
 MAX_DOCUMENT_BYTES = 32 << 20
-"""Largest size of a JSON or TOML file in bytes. The parsed file takes up to 24 times as much memory."""
+"""Largest size of a JSON or TOML file in bytes, unless a reader allows more. The parsed file takes up to 32 times as
+much memory."""
+MAX_PARSED_BYTES = 1 << 30
+"""Most memory in bytes that a file of more than MAX_DOCUMENT_BYTES may take, by `parsed_bytes`."""
+_OBJECT_BYTES = {b"[": 72, b"{": 256, b",": 48, b'"': 32}
+"""Most bytes that Python needs for a list, a dict, a value after a comma, and half a text, keyed by their signs."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 """First bytes of the pointer file that Git LFS leaves in place of a file that was not fetched."""
 MAX_LFS_POINTER_BYTES = 1024
@@ -58,7 +63,7 @@ def _digest(path: str | os.PathLike[str], state: Any) -> str:
 def is_file(path: str | os.PathLike[str]) -> bool:
     """True if `path` is a regular file. False, and no exception, for a name that no file can have."""
     try:
-        return stat.S_ISREG(Path(path).stat().st_mode)
+        return stat.S_ISREG(os.stat(path).st_mode)  # noqa: PTH116  # Path(path) takes longer than the call
     except (OSError, ValueError):
         return False
 
@@ -103,16 +108,32 @@ def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) ->
     """The text of a UTF-8 file of at most `limit` bytes, without a byte order mark.
 
     expected: text that follows "expected" in error messages.
-    Raises InputError like `open_input`, and for a longer file or another encoding.
+    Raises InputError like `open_input`, and for a longer file or another encoding. Also raises it for a file of more
+    than MAX_DOCUMENT_BYTES whose JSON would take more than MAX_PARSED_BYTES.
     """
     with open_input(path, expected) as file:
-        data = file.read(limit + 1)
+        size = max(os.fstat(file.fileno()).st_size, MAX_DOCUMENT_BYTES)
+        data = file.read(min(limit, size) + 1)
     if len(data) > limit:
         raise InputError(f"{path}: has more than {limit >> 20} MiB, expected {expected}")
+    if len(data) > MAX_DOCUMENT_BYTES and (needed := parsed_bytes(data)) > MAX_PARSED_BYTES:
+        raise InputError(
+            f"{path}: its {len(data) >> 20} MiB may take {needed >> 20:,} MiB of memory, expected {expected} that "
+            f"takes at most {MAX_PARSED_BYTES >> 20:,} MiB; remove values that are not needed"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not text in UTF-8 (byte {error.start}), expected {expected}") from None
+
+
+def parsed_bytes(data: bytes) -> int:
+    """Upper estimate of the memory in bytes that a JSON text takes while it is parsed: the text and Python's objects.
+
+    data: the text in UTF-8. Its brackets, commas and quotes are counted, so that nothing is parsed.
+    """
+    objects = sum(size * data.count(sign) for sign, size in _OBJECT_BYTES.items())
+    return objects + len(data) * (2 if data.isascii() else 5)  # the file, and 1 or up to 4 bytes a character of text
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
 from clsplat.models.edit import moved
 from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of, tracked_in_view
 from clsplat.scenes.readers import colmap
+from clsplat.scenes.readers.colmap_points import Tracks
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
 from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
 
@@ -81,7 +82,7 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
         raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
     model, tracks = read
     weights = 1 / (1 + np.square(np.maximum(tracks.errors, 0.0)))
-    tracked = sorted(name for name, rows in tracks.by_image.items() if len(rows))
+    tracked = sorted(tracks.tracked)
     if not tracked:
         raise InputError(f"{model}: no point has a track, and {asked} needs tracks; export the model with them")
     shown = tracks.shown_in([view.name for view in scene.train_views])
@@ -218,7 +219,7 @@ def _maps_in(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
+def _tracks_of(scene: Scene) -> tuple[Path, Tracks] | None:
     """Return the folder of the COLMAP model that the scene was read from, and its tracks; None for other scenes."""
     model = None if scene.source is None else colmap.find_model(scene.source)
     if model is None:

@@ -18,8 +18,8 @@ from clsplat.runs import scene_record
 from clsplat.runs.run import Run
 from clsplat.scenes.depth_sources import DEPTH_TO_UNIT, length_unit_of
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.readers.colmap import Tracks
-from clsplat.scenes.scene import Scene
+from clsplat.scenes.readers.colmap_points import Tracks
+from clsplat.scenes.scene import Scene, View
 from clsplat.training.preparation import prepared
 from clsplat.training.trainer import Trainer
 
@@ -96,12 +96,18 @@ def test_a_prepared_scene_keeps_its_unit(tmp_path: Path) -> None:
     assert prepared(made, config).length_unit == made.length_unit == scene.extent
 
 
+def seen_by(view: View, points: np.ndarray) -> Tracks:
+    """Tracks of points that one photograph shows."""
+    count = len(points)
+    return Tracks(points, np.zeros(count), [view.name], np.zeros(count, np.int32), np.arange(1, count + 1))
+
+
 def test_tracks_tell_what_a_photograph_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Points behind a wall are in the frame, but not in the photograph."""
     scene = replace(street(tmp_path / "scene"), source=tmp_path / "scene")
     view = scene.train_views[0]
     shown = view.camera.position + np.array([[1.0], [2.0], [3.0]]) * view.camera.rotation[2]
-    tracks = Tracks(shown, np.zeros(3), {view.name: np.arange(3)})
+    tracks = seen_by(view, shown)
     monkeypatch.setattr("clsplat.scenes.readers.colmap.read_tracks", lambda _: tracks)
     assert length_unit_of(scene) == pytest.approx(DEPTH_TO_UNIT * 2)
 
@@ -112,7 +118,7 @@ def test_tracks_of_another_world_frame_do_not_count(tmp_path: Path, monkeypatch:
     view = scene.train_views[0]
     behind = view.camera.position - np.array([[1.0], [2.0], [3.0]]) * view.camera.rotation[2]
     ahead = 0.1 * view.camera.position + np.array([[100.0, 40, 30]])  # before the camera, but far beside its picture
-    tracks = Tracks(np.concatenate([behind, ahead]), np.zeros(4), {view.name: np.arange(4)})
+    tracks = seen_by(view, np.concatenate([behind, ahead]))
     monkeypatch.setattr("clsplat.scenes.readers.colmap.find_model", lambda _: tmp_path)
     monkeypatch.setattr("clsplat.scenes.readers.colmap.read_tracks", lambda _: tracks)
     assert length_unit_of(replace(scene, source=tmp_path / "scene")) == wanted

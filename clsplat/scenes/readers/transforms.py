@@ -45,6 +45,8 @@ NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """Default scale and offset of instant-ngp, whose positions are scale * p + offset for positions p of the file."""
 LAST_ROW_TOLERANCE = 1e-6
 """Maximum deviation of a pose's last row from 0 0 0 1. Products of float32 matrices deviate by less."""
+MAX_TRANSFORMS_BYTES = 512 << 20
+"""Largest size of a transforms.json in bytes. A frame takes about 1 KB, and 3 KB of memory, which has its own limit."""
 FOCAL_ANGLE_TOLERANCE = 0.02
 """Relative tolerance between a focal length and the angle of view in the same file.
 
@@ -68,7 +70,7 @@ def read_transforms(
     Warns of ignored keys and of contradictions. Raises InputError that names the file and the key for invalid JSON, for
     a key that is missing or has the wrong type, and for missing pictures.
     """
-    document = load_document(path)
+    document = load_document(path, limit=MAX_TRANSFORMS_BYTES)
     readers = _readers(path, document)
     files = _pictures(path, readers, images, missing)
     there = [(keys, file) for keys, file in zip(readers, files, strict=True) if file is not None]
@@ -160,7 +162,7 @@ def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedIm
 
     size: (width, height) of missing pictures; needed if the file has no `w` and `h`.
     """
-    readers = _readers(path, load_document(path))
+    readers = _readers(path, load_document(path, limit=MAX_TRANSFORMS_BYTES))
     with warnings.catch_warnings():  # no warnings of missing pictures: only names are needed
         warnings.simplefilter("ignore")
         try:
