@@ -61,6 +61,19 @@ def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tup
     return (*QUICK_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else QUICK_SHAPES
 
 
+DEFAULT = [index for index in KEPT if open_device(str(index)) is open_device()]
+"""Index of the default driver; none without a driver."""
+
+
+def has_slow_parameters(index: int, shape: tuple[Any, ...] | None) -> bool:
+    """Whether slow parameters of a test run on a driver, in a shape; None: in its own.
+
+    Only the default driver has them, in the shapes of the quick run: each pair of a parameter and a driver, or of a
+    parameter and a shape, builds kernels of its own, which takes nine tenths of such a test's time.
+    """
+    return index in DEFAULT and shape in {None, *QUICK_SHAPES}
+
+
 @cache
 def shaped(device: Device, lanes: int, items: int, by_gaussian: bool = False) -> Device:
     """The device in another shape. All tests share it, because each new one builds its kernels again.
