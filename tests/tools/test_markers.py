@@ -11,7 +11,7 @@ import needs
 import pytest
 from calls import python, refuses
 from drivers import KEPT, NARROW
-from pipeline import DEFAULT, QUICK_SHAPES, has_slow_parameters
+from pipeline import COMMON_SHAPES, DEFAULT, has_slow_parameters
 from quick import quick
 
 from clsplat.device.context import Device
@@ -41,7 +41,7 @@ def test_all_but_the_chosen_are_slow() -> None:
 
 def test_slow_parameters_run_on_the_default_driver() -> None:
     (index,) = DEFAULT
-    assert all(has_slow_parameters(index, shape) for shape in (None, *QUICK_SHAPES))
+    assert all(has_slow_parameters(index, shape) for shape in (None, *COMMON_SHAPES))
     assert not has_slow_parameters(index, (1, 1))
     assert not has_slow_parameters(index + 1, None)
 
@@ -49,7 +49,7 @@ def test_slow_parameters_run_on_the_default_driver() -> None:
 @pytest.mark.parametrize("name", quick(["a", "b"], "a"))
 def test_a_slow_parameter_meets_no_shape_but_those(shaped_device: Device, name: str) -> None:
     shape = shaped_device.shape
-    assert name == "a" or (shape.lanes, shape.items) in QUICK_SHAPES
+    assert name == "a" or (shape.lanes, shape.items) in COMMON_SHAPES
 
 
 def test_words_narrow_the_drivers_down(monkeypatch: pytest.MonkeyPatch) -> None:
