@@ -221,6 +221,7 @@ def test_approximate_switches_in_every_shape_and_on_every_device(device: Device,
         assert_same_bits(got.frame.blended.image.get(), wanted.frame.blended.image.get())
 
 
+@pytest.mark.slow
 def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
     got = gradients(run(shaped(default_device, 8, 1), "overlap", RasterizerConfig(sh_degree_limit=1)))["sh"]
     assert got[:, 1:4].any()

@@ -449,6 +449,7 @@ def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monk
     assert untrusting.exists()
 
 
+@pytest.mark.slow
 def test_training_asks_for_it(
     untrusting: Path, scene: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
