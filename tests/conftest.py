@@ -24,7 +24,7 @@ from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from groups import begin_apart, in_one_order, scheduler
 from needs import missing
 from passed import leave_out, pytest_addoption, record  # noqa: F401  # a hook
-from pipeline import QUICK_SHAPES, shaped, shapes_of
+from pipeline import COMMON_SHAPES, has_slow_parameters, shaped, shapes_of
 from same_bytes import undisturbed  # noqa: F401  # a fixture
 from tiny import CONFIG, FEW, short, write_scene
 
@@ -58,14 +58,27 @@ def _driver_and_shape(item: pytest.Item) -> tuple[Any, Any]:
     return shaped if isinstance(shaped, tuple) else (None, None)
 
 
+def _is_left_out(item: pytest.Item) -> bool:
+    """Whether a test is a slow parameter on a driver, or in a shape, that has no slow ones.
+
+    Tests that compare with `default_device` have all parameters on each driver.
+    """
+    index, shape = _driver_and_shape(item)
+    if index is None or not isinstance(item, pytest.Function) or "default_device" in item.fixturenames:
+        return False
+    return not has_slow_parameters(index, shape) and any(mark.name == "slow" for mark in item.callspec.marks)
+
+
 @pytest.hookimpl(tryfirst=True)  # before the slow ones are left out
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The quick run has two shapes, or with `slow_in_groups` one, as building is slow."""
+    """The quick run has the shape for CPUs, as building kernels for groups of work-items takes long."""
     in_one_order(config, items)
     leave_out(config, items, lambda item: _driver_and_shape(item)[0])
+    pairs = {item for item in items if _is_left_out(item)}
+    config.hook.pytest_deselected(items=list(pairs))
+    items[:] = [item for item in items if item not in pairs]
     for item in items:
-        shape = _driver_and_shape(item)[1]
-        if shape not in {None, *(QUICK_SHAPES[:1] if item.get_closest_marker("slow_in_groups") else QUICK_SHAPES)}:
+        if _driver_and_shape(item)[1] not in {None, COMMON_SHAPES[0]}:
             item.add_marker(pytest.mark.slow)
         for marker in item.iter_markers("needs"):
             if reason := missing(*marker.args):

@@ -314,6 +314,7 @@ def test_table(capsys: Capture) -> None:
     assert queue[1][-3:-1] == ["0", "1"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_quick")
 def test_scene_run_and_model(tmp_path: Path, capsys: Capture) -> None:
     scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
@@ -377,6 +378,7 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
     assert result["exact_switches_faster"] is None, "nothing has them off"
 
 
+@pytest.mark.slow
 def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff, "REFERENCE_CROP_SIDE_PX", 48)
     every = tradeoff.settings()

@@ -142,15 +142,20 @@ def interrupt(stage: str, report_number: int, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("stage", "report_number", "at"),
     [
-        ("frames", 1, ""),
         ("cameras", 1, ""),
-        ("training", 1, ""),  # before the run exists
-        ("training", 2, " before the first checkpoint"),
         ("training", 3, " at step 10"),
-        ("report", 1, ""),
-        ("thumbnail", 1, ""),
-        ("turntable", 1, ""),
         ("turntable", 4, ""),  # while the video is encoded
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (
+                ("frames", 1, ""),
+                ("training", 1, ""),  # before the run exists
+                ("training", 2, " before the first checkpoint"),
+                ("report", 1, ""),
+                ("thumbnail", 1, ""),
+                ("turntable", 1, ""),
+            )
+        ),
     ],
 )
 def test_ctrl_c_and_the_same_call_again(

@@ -134,6 +134,7 @@ def assert_interrupted(number: int, before: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
@@ -150,6 +151,7 @@ def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
     )
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("number", quick(SIGNALS, signal.SIGINT))
 def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:

@@ -197,6 +197,7 @@ def wait_until(ready: Callable[[], bool], process: subprocess.Popen[str]) -> Non
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 @posix
 def test_ctrl_c_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long_model: bytes, capfd: Capture) -> None:
     run = tmp_path / "run"

@@ -299,6 +299,7 @@ use()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="takes away what only POSIX has")
 def test_no_module_wants_what_only_posix_has(tmp_path: Path) -> None:
     random_gaussians(4).save(tmp_path / "a.ply")

@@ -274,6 +274,7 @@ def start(shot: list[str], folder: Path, *more: str) -> subprocess.Popen[str]:
     return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("number", quick([signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)], signal.SIGINT))
 def test_interrupted(number: int, shot: list[str], tmp_path: Path) -> None:
@@ -291,6 +292,7 @@ def test_interrupted(number: int, shot: list[str], tmp_path: Path) -> None:
     assert all(name.startswith("a.") for name in names)
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_gone(shot: list[str], tmp_path: Path) -> None:
     process = start(shot, tmp_path, "--count", "3000", "--progress", "json")
     process.stdout.readline()

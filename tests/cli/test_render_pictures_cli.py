@@ -378,6 +378,7 @@ def test_matrices_in_the_header_are_those_of_openexr(shot: list[str], tmp_path: 
         np.testing.assert_allclose([x / w, y / w], wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("distributed")
 def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
     import distributed

@@ -15,6 +15,7 @@ from systems import can_link
 from tiny import HEIGHT
 
 
+@pytest.mark.slow
 @pytest.mark.needs("av")
 def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     import av

@@ -51,6 +51,7 @@ CASES = {
 """Calls, and their status."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", quick(CASES, "convert model.ply new.ply", "nonsense"))
 def test_closed_streams(line: str, folder: Path) -> None:
     status = CASES[line]
@@ -82,6 +83,7 @@ def test_standard_output_on_a_full_disk(verb: str, folder: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_standard_error_on_a_full_disk(folder: Path) -> None:
     assert shell("clsplat info none.ply 2>/dev/full", folder).returncode == 2

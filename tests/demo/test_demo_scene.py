@@ -111,6 +111,7 @@ def test_cameras_stand_inside_the_wall_and_look_at_the_middle():
         assert abs(view.fx * x / z) < 40 and abs(view.fy * y / z) < 40
 
 
+@pytest.mark.slow
 def test_the_view_to_time_a_step_on(surfaces, monkeypatch):
     """The Gaussians lie on surfaces that the photograph shows: rays to those in front hit nothing before them."""
     monkeypatch.setattr(measured_view, "still_life", lambda: surfaces)

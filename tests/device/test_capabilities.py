@@ -38,6 +38,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, device: Device, pretended: str, shap
     return Device(device.cl_device)
 
 
+@pytest.mark.slow
 def test_a_gpu(scene: Scene, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels in groups, photographs that are copied, and a driver that chooses the groups of an image's kernels."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")  # so that both send each camera once

@@ -166,6 +166,7 @@ def test_what_is_left_of_a_failure(trial: dict[str, str], kernels: dict[str, str
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("python", [None, "", "missing"])
 def test_a_python_that_cannot_be_started(
     python: str | None, standing: Standing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture

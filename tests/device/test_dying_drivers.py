@@ -65,6 +65,7 @@ def test_a_driver_that_fails_in_every_shape(
     assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "verb"),
     [("launch", "eval"), *(pytest.param(how, "bench", marks=pytest.mark.slow) for how in ("abort", "hang"))],
@@ -91,6 +92,7 @@ def test_another_shape_is_taken(
     assert found[DRIVER]["shape"] != f"{label.replace('x', ' lanes x ')} items"
 
 
+@pytest.mark.slow
 def test_a_program_without_kernels_is_built_anew(
     standing: Standing, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
 ) -> None:
@@ -120,6 +122,7 @@ def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: py
     refuses("signal 6", device.kernels, "scan", error=DriverError)
 
 
+@pytest.mark.slow
 def test_modules_of_the_folder_that_we_are_in_are_not_taken(
     standing: Standing, scene: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,6 +173,7 @@ def test_a_trial_that_there_is_no_memory_for_is_left_out(
     selection.open_device()._built("scan", selection.open_device()._fma[0])
 
 
+@pytest.mark.slow
 def test_what_failed_in_every_shape_is_tried_anew(
     standing: Standing, standing_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
 ) -> None:

@@ -38,6 +38,7 @@ def put(results: Any) -> None:
         results.put(str(error))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [name for name in ("fork", "spawn", "forkserver") if hasattr(os, "fork") or name == "spawn"]
 )

@@ -64,7 +64,6 @@ def over(pixels: list[NDArray[np.float64]], spec: Any) -> NDArray[np.float64]:
     return flat.reshape(spec.height, spec.width, 4)
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", quick(SCENES, "overlap", "orthographic cloud"))
 def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = SCENES[name]()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_same_bits
+from quick import quick
 from slices import flattened, in_front
 
 from clsplat.arrays import Float32
@@ -79,7 +80,7 @@ def test_flattened_it_is_the_mean(kind: str) -> None:
     assert (slices[1:, ..., 4] > slices[:-1, ..., 4])[there[1:]].all() and not (there[1:] & ~there[:-1]).any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", quick(KINDS, next(iter(KINDS))))
 def test_at_each_depth_it_is_the_mean_of_the_samples(kind: str) -> None:
     pipeline, camera = pipeline_of(KINDS[kind]), moving(KINDS[kind].middle)
     slices = deep(pipeline, camera)

@@ -61,7 +61,6 @@ def in_front(gaussians: Gaussians, camera: Camera, depth: float) -> Gaussians:
     return replace(gaussians, opacity_logits=np.where(depths < depth, gaussians.opacity_logits, -20).astype(np.float32))
 
 
-@pytest.mark.slow_in_groups
 def test_against_the_twin(shaped_device: Device) -> None:
     gaussians, camera = CLOUD
     layers = layered(camera)
@@ -79,6 +78,7 @@ def test_against_the_twin(shaped_device: Device) -> None:
     assert_same_bits(np.ascontiguousarray(got.alpha[free]), np.ascontiguousarray(plain.alpha[free]))
 
 
+@pytest.mark.slow
 @EVERY_SHAPE
 def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
     gaussians, camera = CLOUD

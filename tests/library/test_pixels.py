@@ -24,7 +24,11 @@ NAMES = {"colours": "values"}
 
 
 @pytest.mark.parametrize(
-    ("depth", "alpha_max"), [(1, 0.99), (2, 0.99), (3, 0.99), (3, 0.999), (4, 0.999), (32, 0.99), (40, 0.99)]
+    ("depth", "alpha_max"),
+    [
+        *((1, 0.99), (3, 0.999), (40, 0.99)),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((2, 0.99), (3, 0.99), (4, 0.999), (32, 0.99))),
+    ],
 )
 def test_pictures_and_gradients_against_dense_compositing(device: Device, depth: int, alpha_max: float) -> None:
     flat, rng = cloud(120, WIDTH, HEIGHT, depth, seed=depth, opaque=0.3), np.random.default_rng(depth)

@@ -282,6 +282,7 @@ def test_numbers_may_be_real_numbers_or_arrays_of_one(changes: dict[str, Any], d
     assert np.array_equal(found.images, expected.images)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [513, *(pytest.param(count, marks=pytest.mark.slow) for count in (768, 1030))])
 def test_any_number_of_channels(channels: int, default_device: Device) -> None:
     """Bit for bit what calls with a part of them give, the gradient by colours too; that by means is their sum, to the

@@ -123,6 +123,7 @@ def test_sh_of_degree_3_by_central_differences(overlap: tuple[Objective, Arrays]
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", quick(["one", "needles", "saturating", "equal_depth"], "one", "saturating"))
 def test_random_directions_on_other_scenes(scene: str) -> None:
     """Along random directions through all parameters of a class at once; those that would cross a discontinuity are

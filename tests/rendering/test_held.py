@@ -64,7 +64,6 @@ def test_bands_that_are_zero_keep_the_bits(device: Device, shares: tuple[float, 
     assert ("sh_degrees" in held(renderer).arrays) == (shares[0] == 0.6)
 
 
-@pytest.mark.slow_in_groups
 def test_degrees_are_those_of_the_gaussians(shaped_device: Device) -> None:
     """Not of zero bands: each Gaussian's other coefficients are there, and would show."""
     gaussians, camera = cloud()

@@ -35,6 +35,8 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.thumbnail import Thumbnail, sharpness_of, thumbnail_of
 
 ACROSS, DOWN = 96, 64
+SQUARE = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+"""Pixels that a point covers, from its own."""
 
 
 def camera_at(angle: float, distance: float) -> Camera:
@@ -58,9 +60,10 @@ def made(count: int = 32, distances: tuple[float, ...] = (4.0,)) -> Scene:
         local = points @ camera.rotation.T + camera.translation
         places = (local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]).astype(int)
         pixels = rng.uniform(0.45, 0.55, (DOWN, ACROSS, 3)).astype(np.float32)
-        for one in np.argsort(-local[:, 2]):
-            x, y = places[one]
-            pixels[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] = colors[one]
+        order = np.argsort(-local[:, 2])
+        x, y = (places[order, None, :] + SQUARE).reshape(-1, 2).T
+        inside = (x >= 0) & (x < ACROSS) & (y >= 0) & (y < DOWN)
+        pixels[y[inside], x[inside]] = colors[np.repeat(order, len(SQUARE))[inside]]  # of equal places the last counts
         view = View(f"{index:02d}.png", camera, Path(f"{index:02d}.png"), "train", lens)
         views.append(view)
         thumbnails[view.name] = Thumbnail(pixels, 0.0, 0.6 + 0.02 * (index % 5))

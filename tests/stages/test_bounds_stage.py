@@ -86,7 +86,6 @@ def test_lists_have_few_lengths(device: Device) -> None:
     assert len(lengths) <= 8 + 4 * 8
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("thinned", [False, True])
 def test_projection_of_some_chunks(shaped_device: Device, *, thinned: bool) -> None:
     gaussians, camera = cloud()
@@ -108,7 +107,6 @@ def test_projection_of_some_chunks(shaped_device: Device, *, thinned: bool) -> N
         assert_same_bits(some.splats.get()[shown][:, WRITTEN], splats[rows[shown]][:, WRITTEN])
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("optimiser", [OptimiserConfig(sparse=True), OptimiserConfig(sparse=True, sh_rest_every=3)])
 def test_a_step_over_the_chunks_in_view(shaped_device: Device, optimiser: OptimiserConfig) -> None:
     """Model, moments, statistics and counts, after a sparse step over all rows and one over the chunks in view."""

@@ -111,7 +111,6 @@ def test_a_camera_is_sent_once_and_a_background_when_it_is_another(device: Devic
     assert device.memory.used == used, "a camera's array goes with the camera"
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", ["cloud", "few", "hidden"])
 @pytest.mark.parametrize("spare", quick([0, 1, 3000], 1))
 @pytest.mark.parametrize("appends", quick([True, False], True))

@@ -274,7 +274,6 @@ def test_a_table_that_ends_too_early_is_refused(default_device: Device) -> None:
         catch_up(default_device, DENSE, model, chunks, *steps, fresh_readback(default_device))
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("every", [1, 3])
 def test_bits_of_project_step(shaped_device: Device, every: int) -> None:
     """The step of a training on a view that shows no Gaussian."""

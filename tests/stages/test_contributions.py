@@ -33,7 +33,6 @@ def contributions(run: Pipeline, fields: SlotFields = WITH) -> np.ndarray:
     return np.where(run.visible, screen.contributions.get(), np.float32(0))
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("size", quick([(1, 1), (17, 15), (33, 1), (64, 48)], (17, 15), (33, 1)), ids=str)
 def test_they_add_up_to_what_is_opaque(shaped_device: Device, size: tuple[int, int]) -> None:
     """Weights and what is left add up to 1 in every pixel: no pixel outside the image counts, none counts twice."""

@@ -83,7 +83,6 @@ def test_the_twin_by_central_differences(name: str) -> None:
     assert_slopes(loss, model.arrays(), gradients, step=STEP, tolerance=2e-6)
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize(
     ("name", "absolute"),
     [
@@ -110,9 +109,15 @@ def test_contributions(default_device: Device, name: str) -> None:
     assert_close_gradient(screen.contributions.get()[shown], exact.contributions[shown], 1e-4, name=name)
 
 
-@pytest.mark.parametrize("items", quick([32, 128, 256], 128))
-@pytest.mark.parametrize("fields", quick([PLAIN_SLOTS, WIDEST_SLOTS], WIDEST_SLOTS), ids=["plain", "all"])
-@pytest.mark.parametrize("name", quick(["panorama", "bent fisheye", "perspective"], "bent fisheye"))
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "fields", "items"),
+    [
+        *(("panorama", PLAIN_SLOTS, 32), ("perspective", PLAIN_SLOTS, 128), ("bent fisheye", PLAIN_SLOTS, 256)),
+        *(("bent fisheye", WIDEST_SLOTS, 32), ("panorama", WIDEST_SLOTS, 128), ("perspective", WIDEST_SLOTS, 256)),
+    ],
+    ids=lambda value: {PLAIN_SLOTS: "plain", WIDEST_SLOTS: "all"}.get(value, str(value)),
+)
 def test_groups_of_32_to_256_items_have_one_order_of_sums(
     default_device: Device, name: str, fields: SlotFields, items: int
 ) -> None:
@@ -146,7 +151,6 @@ def test_poisoned_memory_changes_no_bit(default_device: Device, monkeypatch: pyt
     assert_same_arrays(first, second)
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", quick(CAMERAS, "bent fisheye"))
 def test_extreme_gaussians_have_finite_gradients(shaped_device: Device, name: str) -> None:
     """Needles, discs, specks and giants, some next to the camera, at a pole, straight behind or not numbers at all."""

@@ -67,7 +67,6 @@ def test_the_twin_by_central_differences(kind: str) -> None:
         assert np.linalg.norm(found[part] - slopes[part]) <= 1e-5 * np.linalg.norm(found[part])
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("kind", quick(KINDS, "perspective"))
 def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
     gaussians, camera = subject(kind, 200)

@@ -21,6 +21,7 @@ from clsplat.rendering.rasterizer import PairCapacity, Rasterizer
 from clsplat.stages.blend import PART_PAIRS, Blended
 from clsplat.stages.device_gaussians import upload_gaussians
 
+pytestmark = pytest.mark.slow  # groups of work-items
 LENGTHS = (1, PART_PAIRS - 1, PART_PAIRS, PART_PAIRS + 1, 2 * PART_PAIRS, 2 * PART_PAIRS + 1, 3000)
 WALL_GAUSSIANS = 4
 WALLS = (40, PART_PAIRS - 4, 2 * PART_PAIRS - 1, 2 * PART_PAIRS + 3, 2 * PART_PAIRS + 300)
@@ -107,8 +108,19 @@ def test_a_list_that_all_pixels_end_early(device: Device) -> None:
     assert not by_place[last:].any()
 
 
-@pytest.mark.parametrize("projection", ["perspective", "fisheye"])
-@pytest.mark.parametrize("variant", quick([*VARIANTS], "everything"))
+@pytest.mark.parametrize(
+    ("variant", "projection"),
+    [
+        ("everything", "fisheye"),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in (
+                *(("colour", "perspective"), ("alpha", "fisheye"), ("nearness", "perspective")),
+                ("everything", "perspective"),
+            )
+        ),
+    ],
+)
 def test_other_gradients_are_those_of_a_lone_item(device: Device, variant: str, projection: Projection) -> None:
     gaussians, camera = listed(1500, WALLS, 2)
     scene = (gaussians, replace(camera, projection=projection))

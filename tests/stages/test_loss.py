@@ -9,6 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from compare import assert_close, assert_same_bits
+from quick import quick
 
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -130,7 +131,7 @@ def test_launches_and_memory(shaped_device: Device) -> None:
     assert device.memory.peak == scratch_bytes(device, 100, 80) + result.gradient.nbytes
 
 
-@pytest.mark.parametrize("width", range(1, 66))
+@pytest.mark.parametrize("width", quick(range(1, 66), 1, 2, 32, 33, 63, 64, 65))
 def test_every_width_up_to_two_blocks(default_device: Device, width: int) -> None:
     """In a shape of several items, of as many rows as columns and of one row."""
     device = default_device.with_shape(lanes=1, items=64)

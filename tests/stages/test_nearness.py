@@ -82,7 +82,6 @@ def picture(camera: Camera) -> np.ndarray:
     return np.random.default_rng(3).random((camera.height, camera.width, 4)).astype(np.float32)
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("alpha_weight", quick([0.0, 0.3], 0.3))
 @pytest.mark.parametrize("fields", quick([NEAR, EVERY_FIELD], EVERY_FIELD))
 def test_gradients_are_the_twins(shaped_device: Device, alpha_weight: float, fields: SlotFields) -> None:
@@ -136,7 +135,6 @@ def test_other_projections(default_device: Device, name: str) -> None:
     assert_close_gradients(got.arrays(), wanted.parameters, 1e-4)
 
 
-@pytest.mark.slow_in_groups
 def test_colour_and_its_gradient_stay_what_they_are(shaped_device: Device) -> None:
     """Nearness beside them, with no weight, changes no bit."""
     gaussians, camera = scenes.NAMED["overlap"]()

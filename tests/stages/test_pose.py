@@ -69,7 +69,6 @@ def test_the_twin_by_central_differences(name: str) -> None:
     assert np.linalg.norm(found - slopes) <= 1e-5 * np.linalg.norm(found)
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize(
     "name", quick(["perspective", *CAMERAS], "perspective", "orthographic", "panorama", "bent fisheye")
 )

@@ -158,7 +158,6 @@ def assert_alike(device: Device, case: Case, count: int, spoil: str = "") -> lis
     return got
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", quick(CASES, "degree 3", "sparse"))
 def test_one_launch_has_the_bits_of_two(shaped_device: Device, name: str) -> None:
     case = CASES[name]

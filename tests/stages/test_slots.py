@@ -115,7 +115,6 @@ def test_bounds(shaped_device: Device) -> None:
     assert_same_bits(got, wanted)
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("thinning", [None, Thinning(0.4, (3, 4))])
 @pytest.mark.parametrize("projection", quick(["perspective", "fisheye"], "perspective"))
 def test_projection(shaped_device: Device, projection: str, thinning: Thinning | None) -> None:
@@ -132,7 +131,6 @@ def test_projection(shaped_device: Device, projection: str, thinning: Thinning |
     assert_same_bits(got.splats.get()[shown][:, WRITTEN], wanted.splats.get()[shown][:, WRITTEN])
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("sparse", quick([False, True], False))
 def test_a_step_of_adam(shaped_device: Device, *, sparse: bool) -> None:
     """And its statistics."""
@@ -159,7 +157,6 @@ def test_a_step_of_adam(shaped_device: Device, *, sparse: bool) -> None:
     model.check()
 
 
-@pytest.mark.slow_in_groups
 def test_catching_up(shaped_device: Device) -> None:
     """Each chunk by another number of steps; a second call changes nothing."""
     model, config = Model(shaped_device), OptimiserConfig()
@@ -179,7 +176,6 @@ def test_catching_up(shaped_device: Device) -> None:
     assert caught.get().tolist() == [9, 0, 9, 9, 0, 9]
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("slots", quick([1, 3], 3))
 def test_more_chunks_than_slots(shaped_device: Device, slots: int) -> None:
     """A projection and a step, some chunks at a time."""

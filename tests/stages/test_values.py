@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from flat import cloud
 from pipeline import EVERY_SHAPE, shaped, shapes_of
@@ -44,6 +45,7 @@ def test_pictures_and_gradients_against_the_twin(shaped_device: Device) -> None:
         assert_close_gradient(array, getattr(of, names.get(name, name)), 5e-6, name=name)
 
 
+@pytest.mark.slow
 @EVERY_SHAPE
 def test_the_same_pictures_in_every_shape(device: Device, every: bool) -> None:
     flat, pictures = cloud(400, 90, 60, 4, opaque=0.2), []

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from calls import Capture
 from drivers import KEPT
+from pipeline import DEFAULT
 from tiny import short
 
 from clsplat.cli.main import main
@@ -26,10 +27,15 @@ ALWAYS = 10**6
 Standing = Callable[..., Path]
 
 
-DRIVER = min((index for index in KEPT if not wants_cache(all_devices()[index])), default=min(KEPT, default=0))
+DRIVER = min(
+    (index for index in KEPT if not wants_cache(all_devices()[index])),
+    key=lambda index: (index not in DEFAULT, index),
+    default=min(KEPT, default=0),
+)
 """Index of the device whose driver misbehaves.
 
-It is one whose driver has a cache, if there is one. With another driver, every process would build all kernels again.
+It is one whose driver has a cache, if there is one, the default one before others. With another driver, every
+process would build all kernels again.
 """
 
 

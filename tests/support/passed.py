@@ -11,8 +11,10 @@ since the second run may have other drivers.
 
 from __future__ import annotations
 
+import ast
 from collections import defaultdict
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,7 +24,7 @@ from clsplat.files.atomic import atomic_write
 WRITE, LEAVE_OUT = "--write-passed", "--leave-out"
 PHASES = {"setup", "call", "teardown"}
 OF_ALL_DRIVERS = {"KEPT", "all_devices", "list_devices"}
-"""Names by which a module's tests may depend on the list of drivers."""
+"""Names by which a test depends on the list of drivers."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -67,5 +69,30 @@ def leave_out(config: pytest.Config, items: list[pytest.Item], driver_of: Callab
 
 
 def _of_all(item: pytest.Item) -> bool:
-    module = item.getparent(pytest.Module)
-    return module is None or bool(OF_ALL_DRIVERS & vars(module.obj).keys())
+    """Whether a test names one of OF_ALL_DRIVERS, itself or through what its module defines and it names."""
+    if not isinstance(item, pytest.Function):
+        return True
+    names, waiting = _names(item.path), [item.originalname]
+    seen: set[str] = set()
+    while waiting:
+        seen.add(name := waiting.pop())
+        waiting += names.get(name, set()) - seen
+    return bool(OF_ALL_DRIVERS & seen)
+
+
+@cache
+def _names(path: Path) -> dict[str, set[str]]:
+    """For each name that a module defines at its top, the names in its definition: decorators and fixtures too."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for statement in ast.parse(path.read_text("utf-8")).body:
+        if isinstance(statement, ast.Import | ast.ImportFrom):
+            continue
+        nodes = list(ast.walk(statement))
+        used = {node.id for node in nodes if isinstance(node, ast.Name)}
+        used |= {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+        used |= {node.arg for node in nodes if isinstance(node, ast.arg)}
+        defined = {getattr(statement, "name", "")}
+        defined |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+        for name in defined:
+            found[name] |= used
+    return found

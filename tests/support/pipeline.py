@@ -31,24 +31,19 @@ from clsplat.stages.project import Screen
 BACKGROUND = (0.1, 0.2, 0.3)
 
 
-QUICK_SHAPES = (8, 1), (1, 64)
-"""Lanes and items of a shape for CPUs, and of one for GPUs."""
+COMMON_SHAPES = (8, 1), (1, 64)
+"""Lanes and items of the shapes that every driver is tested in: one for CPUs, and one for GPUs."""
+DEFAULT = [index for index in KEPT if open_device(str(index)) is open_device()]
+"""Index of the default driver; none without a driver."""
 
 
 EVERY_SHAPE = pytest.mark.parametrize(
     ("device", "every"),
-    [
-        *(pytest.param(index, False, id=label(index)) for index in KEPT),
-        *(
-            pytest.param(index, True, id=f"{label(index)}-every", marks=pytest.mark.slow)
-            for index in KEPT
-            if open_device(str(index)) is open_device()
-        ),
-    ],
+    [pytest.param(index, every := index in DEFAULT, id=f"{label(index)}{'-every' if every else ''}") for index in KEPT],
     indirect=["device"],
 )
-"""Mark of a test that runs all shapes at once. On each driver it has two, since builds take most of the time; among
-slow tests the default driver has all."""
+"""Mark of a test that runs all shapes at once. On each driver it has two, since builds take most of the time; the
+default driver has all."""
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
@@ -58,7 +53,16 @@ def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tup
         work-item, and `more`. tools/ci/digests.py tests every driver in every shape.
     """
     every = every and device is open_device()
-    return (*QUICK_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else QUICK_SHAPES
+    return (*COMMON_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else COMMON_SHAPES
+
+
+def has_slow_parameters(index: int, shape: tuple[Any, ...] | None) -> bool:
+    """Whether slow parameters of a test run on a driver, in a shape; None: in its own.
+
+    Only the default driver has them, in COMMON_SHAPES: each pair of a parameter and a driver, or of a
+    parameter and a shape, builds kernels of its own, which takes nine tenths of such a test's time.
+    """
+    return index in DEFAULT and shape in {None, *COMMON_SHAPES}
 
 
 @cache

@@ -133,6 +133,7 @@ def test_vectors_are_made_of_elements() -> None:
         assert "image_gradient + pixel, stride) & inside" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.needs("oclgrind")
 @pytest.mark.parametrize("check", CHECKS)
 def test_planted_faults_are_found(check: str, tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from pipeline import shaped
 from quick import quick
 
 from clsplat.config.channels import FRAME_CHANNELS
-from clsplat.device.context import Device
+from clsplat.device.context import Device, all_devices
+from clsplat.device.selection import select
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -36,8 +37,8 @@ def test_drivers_take_turns() -> None:
 
 
 def test_the_short_table_has_every_driver_and_every_shape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """That is as SAME_ORDER needs it: 1x64 on every driver, and the shapes of its order beside it on the first. None
-    that hangs is waited for."""
+    """That is as SAME_ORDER needs it: 1x64 on every driver, and the shapes of its order beside it on the default
+    one. None that hangs is waited for."""
     monkeypatch.setenv("CLSPLAT_RUSTICL", "libRusticlOpenCL.so.1")
     (tmp_path / "whole").mkdir()
     (tmp_path / "short").mkdir()
@@ -45,8 +46,9 @@ def test_the_short_table_has_every_driver_and_every_shape(tmp_path: Path, monkey
     assert {(job.driver, job.shape) for job in short} <= {(job.driver, job.shape) for job in whole}
     assert {job.driver for job in short} == {job.driver for job in whole}
     assert [job.shape for job in short if job.driver == "Rusticl"] == ["1x64"]
-    first = {job.shape for job in whole if job.index == 0}
-    assert {job.shape for job in short if job.index == 0} == first and set(SAME_ORDER) <= first
+    default = all_devices().index(select(None))
+    every = {job.shape for job in whole if job.index == default}
+    assert {job.shape for job in short if job.index == default} == every and set(SAME_ORDER) <= every
     for index in {job.index for job in whole} - {-1}:
         there = {job.shape for job in whole if job.index == index}
         assert {job.shape for job in short if job.index == index} >= there & set(IN_SHORT)

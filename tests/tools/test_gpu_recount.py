@@ -23,6 +23,7 @@ from gpu_static import FRAMES
 from clsplat.errors import ClsplatError
 
 
+@pytest.mark.slow
 def test_older_code_and_its_launches(tmp_path: Path) -> None:
     older_code("HEAD", tmp_path)
     (frame,) = [each for each in json.loads(FRAMES.read_text())["frames"] if each["name"] == "fox-like"]

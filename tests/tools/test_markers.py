@@ -11,8 +11,10 @@ import needs
 import pytest
 from calls import python, refuses
 from drivers import KEPT, NARROW
+from pipeline import COMMON_SHAPES, DEFAULT, has_slow_parameters
 from quick import quick
 
+from clsplat.device.context import Device
 from clsplat.device.drivers.shapes import Shape
 from clsplat.device.selection import list_devices
 from clsplat.selftest.driver_check import DriverReport
@@ -35,6 +37,19 @@ def test_all_but_the_chosen_are_slow() -> None:
     assert found == {"a": [], "b": ["slow"], "c": []}
     with pytest.raises(AssertionError):
         quick("abc", "d")
+
+
+def test_slow_parameters_run_on_the_default_driver() -> None:
+    (index,) = DEFAULT
+    assert all(has_slow_parameters(index, shape) for shape in (None, *COMMON_SHAPES))
+    assert not has_slow_parameters(index, (1, 1))
+    assert not has_slow_parameters(index + 1, None)
+
+
+@pytest.mark.parametrize("name", quick(["a", "b"], "a"))
+def test_a_slow_parameter_meets_no_shape_but_those(shaped_device: Device, name: str) -> None:
+    shape = shaped_device.shape
+    assert name == "a" or (shape.lanes, shape.items) in COMMON_SHAPES
 
 
 def test_words_narrow_the_drivers_down(monkeypatch: pytest.MonkeyPatch) -> None:

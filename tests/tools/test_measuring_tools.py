@@ -57,6 +57,7 @@ def test_sort(tmp_path: Path, capsys: Capture) -> None:
     assert any("10,000" in line for line in bench_sort.table(result))
 
 
+@pytest.mark.slow
 def test_library(capsys: Capture) -> None:
     result = measured(capsys, bench_library, "--gaussians", "300", "--size", "40x30", "--repeat", "1")
     rows = {row["call"]: row for row in result["rows"]}

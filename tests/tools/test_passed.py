@@ -49,7 +49,10 @@ import pytest
 KEPT = [0, 1]
 @pytest.mark.parametrize("device", [1], ids=["driver-1.0"])
 def test_of_one(device): pass
-def test_of_all(): pass
+@pytest.fixture
+def several(): return len(KEPT)
+def test_of_all(several): pass
+def test_of_none(): pass
 """
 SECOND = {
     "tests/test_some.py::test_fails",
@@ -60,6 +63,7 @@ SECOND = {
 FIRST = {
     *(f"tests/test_some.py::test_passes[{name}]" for name in ("a@b", "c d", "e")),
     "tests/test_drivers.py::test_of_one[driver-1.0]",
+    "tests/test_drivers.py::test_of_none",
 }
 
 

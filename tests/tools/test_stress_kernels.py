@@ -103,10 +103,12 @@ def test_a_wrong_camera_is_found(
     assert any(error in fault for fault in row["faults"])
 
 
+@pytest.mark.slow
 def test_stages_by_themselves(device: Device) -> None:
     assert stages(device, seed=1, many=4)["faults"] == []
 
 
+@pytest.mark.slow
 def test_a_wrong_loss_is_found(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loss, "l1_dssim", lambda x, y, weight: l1_dssim(x, y, weight + 1e-3))
     faults = stages(default_device, seed=1, many=2)["faults"]
@@ -126,6 +128,7 @@ def test_command(tmp_path: Path) -> None:
     assert plot.stat().st_size > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -128,6 +128,7 @@ def run(tool: ModuleType, folder: Path, *more: str) -> subprocess.CompletedProce
     return python(*words, timeout=PATIENCE, cwd=folder, env=environment)
 
 
+@pytest.mark.slow
 def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> None:
     body = "import os, pytest\n@pytest.mark.parametrize('i', range(6))\ndef test_it(i):\n    if i == 3: os.abort()\n"
     (tmp_path / "test_aborts.py").write_text(body)
@@ -180,6 +181,7 @@ def test_all_processes_have_one_order() -> None:
     assert [f"{item.path}{item.name}" for item in items] == ["a1", "a2", "b1", "b0"]
 
 
+@pytest.mark.slow
 def test_a_group_stays_in_one_process(tool: ModuleType, tmp_path: Path) -> None:
     for name in ("test_one.py", "test_other.py"):
         (tmp_path / name).write_text(NOTES)

@@ -77,6 +77,7 @@ def test_a_dry_run_of_every_part(tmp_path: Path, capsys: Capture) -> None:
         assert sums or row["bits"] == ("" if row["stage"] == "statistics" else "same"), row
 
 
+@pytest.mark.slow
 def test_no_time_is_left(tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "trial.json"
     text = printed(capsys, ["--dry-run", "--minutes", "1e-9", "--out", out], call=trial.main).out
@@ -194,6 +195,7 @@ def sources(folder: Path, setup: str) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_peers_that_cannot_be_built(tmp_path: Path) -> None:
     folder = sources(tmp_path / "peers", "raise SystemExit('no compiler here')")
     builds = trial_peers.Builds(folder, tmp_path / "built")
@@ -205,6 +207,7 @@ def test_peers_that_cannot_be_built(tmp_path: Path) -> None:
     assert late.failed["gsplat"] == "its build was not done in time"
 
 
+@pytest.mark.slow
 def test_a_peer_that_cannot_be_run(tmp_path: Path) -> None:
     told = trial_peers.measure("gsplat", tmp_path / "missing.npz", 1, tmp_path, 120)
     assert isinstance(told, str)
@@ -267,6 +270,7 @@ def test_what_the_peers_are_given(fakes: dict[str, list[Any]], tmp_path: Path) -
     assert arrays["moments_sh_coefficients_rest"].shape == (20, 15, 3, 2)
 
 
+@pytest.mark.slow
 def test_parts_that_need_cuda(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capture) -> None:
     """Of two programs on two scenes one cannot be run; counters are asked for once, of the first scene."""
     answers = {"gsplat": {"frame_ms": 1.5, "step_ms": 6.5, "loss": "L1"}, "Faster-GS": "a reason"}

@@ -248,6 +248,7 @@ def test_trouble_on_a_further_device_ends_the_training(
     assert ended.is_set(), "the other device's view was waited for"
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_batch_is_tried_before_anything_changes(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

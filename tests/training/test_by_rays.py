@@ -90,6 +90,7 @@ def test_what_it_does_not_go_with(folder: Path, tmp_path: Path, capsys: Capture)
     assert "perspective is rays, a resumed run cannot change it to plane" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_settings_are_not_compared_along_rays(tmp_path: Path, capsys: Capture) -> None:
     replace(hidden_model(), by_rays=True).save(tmp_path / "rays.ply")
     assert main(["bench", str(tmp_path / "rays.ply"), "--plot", str(tmp_path / "plot.svg"), "--size", "64x48"]) == 2

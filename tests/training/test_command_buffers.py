@@ -45,23 +45,33 @@ def trained(
 def test_every_setting_has_its_bytes(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str
 ) -> None:
-    """Without command buffers, with them, and with each launch compared with the recorded one; in a group's shape
-    too."""
+    """Without command buffers, with them, and with each launch compared with the recorded one."""
+    check_uses(default_device, ("0", "1", CHECK_TAPES), folder, monkeypatch, setting)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["plain", "contributions", "late", "all"])
+def test_in_groups_too(default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
+    check_uses(default_device.with_shape(lanes=1, items=64), ("1",), folder, monkeypatch, setting)
+
+
+def check_uses(
+    device: Device, uses: tuple[str, ...], folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str
+) -> None:
+    """A training with each value of TAPES has the bytes of one without command buffers and with exact counts."""
     config, replayed, checked = SETTINGS[setting], [], []
     scene = scene_for(folder, config)
-    group = default_device.with_shape(lanes=1, items=64)
     for name, calls in (("set", replayed), ("check", checked)):
         real = getattr(CommandBuffer, name)
         monkeypatch.setattr(CommandBuffer, name, lambda *given, real=real, calls=calls: (calls.append(1), real(*given)))
-    for device, uses in ((default_device, ("0", "1", CHECK_TAPES)), (group, ("1",))):
-        exact = trained(device, scene, config, monkeypatch, "0", capacity=False)
-        for use in uses:
-            replayed.clear(), checked.clear()
-            other = trained(device, scene, config, monkeypatch, use)
-            assert_alike(other, exact)
-            assert (other[2].pending.redone > 0) == (config.batch == 1)
-            assert (len(replayed) > 8) == (use == "1" and config.batch == 1)
-            assert (len(checked) > 8) == (use == CHECK_TAPES and config.batch == 1)
+    exact = trained(device, scene, config, monkeypatch, "0", capacity=False)
+    for use in uses:
+        replayed.clear(), checked.clear()
+        other = trained(device, scene, config, monkeypatch, use)
+        assert_alike(other, exact)
+        assert (other[2].pending.redone > 0) == (config.batch == 1)
+        assert (len(replayed) > 8) == (use == "1" and config.batch == 1)
+        assert (len(checked) > 8) == (use == CHECK_TAPES and config.batch == 1)
 
 
 @pytest.mark.parametrize("batch", [1, 2])

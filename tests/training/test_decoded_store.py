@@ -188,6 +188,7 @@ def test_a_training_whose_disk_is_full(
     assert len([each for each in told if "can be written there" in str(each.message)]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other",
     [

@@ -76,7 +76,6 @@ def gradients_of(
     return run.image, frame.projected.tile_counts.get(), run.backward(d_image)[0]
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("projection", quick(["perspective", "orthographic", "fisheye"], "perspective"))
 def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device, projection: str) -> None:
     """The twin's in perspective; where it draws nothing else, those of the kernels without thinning."""

@@ -122,6 +122,7 @@ def test_a_resumed_run_is_an_uninterrupted_one(
     assert_same_arrays(stopped(10, scene, config, default_device, tmp_path / "stopped"), whole)
 
 
+@pytest.mark.slow
 def test_gradients_in_memory_change_no_bit(scene: Scene, default_device: Device) -> None:
     """project_step takes the step of project_grad and adam one after the other."""
     camera, photograph = scene.views[0].camera, scene.views[0].load()

@@ -57,7 +57,6 @@ def masked_step(device: Device, subject: tuple[Any, Any], image: np.ndarray, wei
     return download_gaussians(gradients), screen.contributions.get(), result.read()[0]
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("weight", [0.0, 0.4])
 def test_gradients_are_the_twins(shaped_device: Device, weight: float) -> None:
     gaussians, camera = subject = scenes.NAMED["overlap"]()

@@ -75,6 +75,12 @@ def _small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 Limits = Callable[[], tuple[Device, HostMemory]]
 
 
+@pytest.fixture(scope="module")
+def whole() -> dict[str, State]:
+    """States of trainings of SETTINGS on a device, by name: one for all limits."""
+    return {}
+
+
 @pytest.fixture(params=["device", "file"])
 def limits(request: pytest.FixtureRequest, default_device: Device, tmp_path: Path) -> Limits:
     """Makes a device and a main memory: chunks in main memory, or in a file."""
@@ -104,10 +110,13 @@ def after(steps: int, trainer: Trainer) -> State:
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_the_bytes_of_a_model_on_the_device(
-    scene: Scene, default_device: Device, limits: Limits, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+    scene: Scene, default_device: Device, limits: Limits, whole: dict[str, State], monkeypatch: pytest.MonkeyPatch,
+    name: str,
+) -> None:  # fmt: skip
     """With clones, halves in several parts, pruned rows, resets, and SH degrees from step 12 and 24 on."""
-    wanted = after(32, trainer_of(scene, SETTINGS[name], default_device))
+    if name not in whole:
+        whole[name] = after(32, trainer_of(scene, SETTINGS[name], default_device))
+    wanted = whole[name]
     moves: list[tuple[int, int]] = []
     noted(monkeypatch, ChunkStore, "move", lambda store, rows, *_: moves.append((store.count, rows is None)))
     trainer = trainer_of(scene, SETTINGS[name], limits)

@@ -67,6 +67,7 @@ def wanted(scene: Scene, default_device: Device) -> State:
         return state(trainer)
 
 
+@pytest.mark.slow
 def test_more_chunks_in_view_than_slots(scene: Scene, wanted: State) -> None:
     """The cameras tell at the start how many rows a view shows, and the pool keeps its size."""
     trainer = limited(scene, LITTLE)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quick import quick
 from scratch_runs import DENSE, LIMIT, SETTINGS, SPARE, STEADY, KilledError, Train, files_of, steps_of
 from tiny import run_steps
 from wide import flip, full
@@ -38,7 +39,7 @@ from clsplat.training.trainer import Trainer
 pytestmark = pytest.mark.usefixtures("starts_wide")  # each training begins with a model of chunks
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", quick(SETTINGS, next(iter(SETTINGS))))
 def test_killed_and_resumed(
     go: Train, whole: Callable[[TrainConfig], bytes], recwarn: pytest.WarningsRecorder, name: str
 ) -> None:
@@ -54,7 +55,9 @@ def test_killed_and_resumed(
     assert not [each for each in recwarn if "not finite" in str(each.message)], "of rows behind the model's last one"
 
 
-@pytest.mark.parametrize("limits", [(LIMIT, None), (None, LIMIT), (LIMIT, 5 << 20), (LIMIT, 64 << 20)])
+@pytest.mark.parametrize(
+    "limits", quick([(LIMIT, None), (None, LIMIT), (LIMIT, 5 << 20), (LIMIT, 64 << 20)], (LIMIT, 5 << 20))
+)
 def test_resumed_under_another_limit(
     go: Train, whole: Callable[[TrainConfig], bytes], limits: tuple[int | None, int | None]
 ) -> None:

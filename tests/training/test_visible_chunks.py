@@ -160,7 +160,7 @@ LIMITS = {
 in view. A host limit puts the chunks into a file."""
 
 
-@pytest.mark.parametrize("optimiser", ["dense", "sparse"])
+@pytest.mark.parametrize("optimiser", quick(["dense", "sparse"], "dense"))
 @pytest.mark.parametrize("name", LIMITS)
 def test_a_streamed_model(
     scene: Scene, default_device: Device, shares: list[float], tmp_path: Path, optimiser: str, name: str,
@@ -455,6 +455,7 @@ def test_a_strategy_that_looks_at_each_step(scene: Scene, default_device: Device
     assert_same(*found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [

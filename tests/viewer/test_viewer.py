@@ -212,6 +212,7 @@ def test_what_makes_no_sense_is_a_line(model: Path) -> None:
     assert all(line.startswith("clsplat: warning: a page sent an invalid message: ") for line in lines)
 
 
+@pytest.mark.slow
 @posix
 def test_ctrl_c_ends_it(model: Path) -> None:
     with clsplat("view", str(model)) as (_, process):

@@ -51,8 +51,8 @@ SAME_ORDER = ("1x32", "1x64", "1x128", "1x256")
 TRAINED = ("8x1", "16x1", "1x1", "1x64")
 """Shapes in which a model is trained, twice. Other work-groups differ from 1x64 only where gradients show it."""
 IN_SHORT = ("8x1", "16x1", "1x1", "1x64", "1x64g", "1x64s")
-"""Shapes of every driver with --short, as in CI: one for each kernel of the gradient. The first driver has all, so that
-each shape is compared with the others there."""
+"""Shapes of every driver with --short, as in CI: one for each kernel of the gradient. The default driver has all, so
+that each shape is compared with the others there."""
 METHODS = {"loops": ("8x1", "1x64"), "cbs": ("1x64",)}
 """Values of POCL_WORK_GROUP_METHOD in addition to PoCL's default, which is loopvec, with the shapes to run."""
 UNKNOWN_METHOD = "Unknown work group generation method"
@@ -140,18 +140,21 @@ def main(arguments: list[str]) -> int:
 def jobs(folder: Path, *, short: bool = False) -> list[Job]:
     """Jobs of every driver in every shape. folder: gets caches and .icd files of drivers.
 
-    short: drivers after the first run only in the shapes IN_SHORT, and Rusticl not in the shape in which it hangs.
+    short: drivers other than the default one (CLSPLAT_DEVICE, or the first) run only in the shapes IN_SHORT, and
+        Rusticl not in the shape in which it hangs.
     """
     from opencl_drivers import use_every_driver
 
     use_every_driver()
     from clsplat.device.context import all_devices
     from clsplat.device.drivers.quirks import subgroup_ways
+    from clsplat.device.selection import select
 
     listed: list[Job] = []
     names = _names()
+    default = all_devices().index(select(None)) if names else 0
     for index, name in enumerate(names):
-        asked = IN_SHORT if short and index else SHAPES
+        asked = IN_SHORT if short and index != default else SHAPES
         able = [shape for shape in asked if shape not in SUBGROUPED or subgroup_ways(all_devices()[index])]
         listed += [Job(name, index, shape, train=shape in TRAINED, environment={}) for shape in able]
     for index, name in enumerate(names):
