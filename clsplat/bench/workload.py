@@ -17,7 +17,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.formats import is_model_name
 from clsplat.progress import Progress
 from clsplat.runs.run import run_of
-from clsplat.scenes.loading import load_scene
+from clsplat.scenes.loading import load_scene, load_scene_of
 from clsplat.scenes.start.initialise import from_scene
 
 
@@ -80,7 +80,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         masks = config.mask_use
-        scene = load_scene(run.scene, **config.scene_arguments(), progress=progress)
+        scene = load_scene_of(config, run.scene, progress=progress)
     else:
         scene, masks = load_scene(path, progress=progress), NO_MASKS
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))

@@ -21,7 +21,7 @@ from clsplat.files.documents import parse_json, read_document
 from clsplat.runs.run import Run, is_run
 from clsplat.scenes.analysis.photo_findings import SHORT_TRAINING_STEPS, findings
 from clsplat.scenes.analysis.recommendations import SCHEDULE_SETTING, answered, paragraph
-from clsplat.scenes.loading import load_scene
+from clsplat.scenes.loading import load_scene_of
 from clsplat.scenes.scene import Scene
 from clsplat.selftest.driver_check import require
 from clsplat.selftest.result import stages_of_training
@@ -93,9 +93,9 @@ def _scene(folder: Path, config: TrainConfig, earlier: Run | None, progress: Cap
 
     earlier: the run that continues; None for a new run.
     """
-    scene = load_scene(
+    scene = load_scene_of(
+        config,
         folder,
-        **config.scene_arguments(),
         progress=progress,
         frame=config.frame_use if earlier is None else earlier.frame_to_resume(),
     )

@@ -431,9 +431,8 @@ def _measured(
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
     config = TrainConfig(resolution=verb.resolution, test_every=verb.test_every, missing="skip")
-    arguments = {**config.scene_arguments(), "masks": masks}
     frame = AS_IN_FILES if run is None else run.frame_for(verb.scene)
-    scene = load_scene(services, verb.scene, arguments, frame)
+    scene = load_scene(services, verb.scene, config, masks=masks, frame=frame)
     renderer = services.renderer(services.require(device, FORWARD_STAGES))
     background = background_colour(verb.background)
 

@@ -141,7 +141,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     flags = {name: getattr(verb, name) for name in ("resolution", "test_every", "test_most", "missing")}
     config = replace(config, **{name: value for name, value in flags.items() if value is not None})
     frame = AS_IN_FILES if trained is None else trained.frame_for(source)
-    scene = load_scene(services, source, config.scene_arguments(), frame)
+    scene = load_scene(services, source, config, frame=frame)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {config.test_every}, expected at least one")

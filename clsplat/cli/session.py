@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +14,8 @@ from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
+    from clsplat.config.masks import MaskUse
+    from clsplat.config.training import TrainConfig
     from clsplat.device.context import Device
     from clsplat.device.selection import DeviceInfo
     from clsplat.evaluation.held_out import Evaluation
@@ -42,7 +44,7 @@ def imported(name: str) -> Callable[..., Any]:
 class Services:
     """Functions of the package that do the verbs' work. Tests replace them."""
 
-    load_scene: Callable[..., Scene] = imported("clsplat.scenes.loading.load_scene")
+    load_scene: Callable[..., Scene] = imported("clsplat.scenes.loading.load_scene_of")
     findings: Callable[..., list[Finding]] = imported("clsplat.scenes.analysis.photo_findings.findings")
     open_device: Callable[..., Device] = imported("clsplat.device.selection.open_device")
     open_devices: Callable[..., list[Device]] = imported("clsplat.device.selection.open_devices")
@@ -59,15 +61,14 @@ class Services:
 def load_scene(
     services: Services,
     path: Path,
-    arguments: Mapping[str, Any],
+    config: TrainConfig,
+    *,
+    masks: MaskUse | None = None,
     frame: FrameUse | SceneFrame = AS_IN_FILES,
     frames: int | None = None,
 ) -> Scene:
-    """Load the scene in the folder `path`, print its warnings, and return it.
-
-    arguments: arguments of `clsplat.load_scene`, from `TrainConfig.scene_arguments`. frame, frames: as for it too.
-    """
-    scene = services.load_scene(path, **arguments, progress=StageProgress(), frame=frame, frames=frames)
+    """Load the scene in the folder `path`, print its warnings, and return it. Arguments as for `load_scene_of`."""
+    scene = services.load_scene(config, path, masks=masks, frame=frame, frames=frames, progress=StageProgress())
     for text in scene.warnings:
         warn(text)
     return scene

@@ -328,9 +328,9 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
     scene = load_scene(
         services,
         source,
-        config.scene_arguments(),
-        config.frame_use if earlier is None else earlier.frame_to_resume(),
-        frames,
+        config,
+        frame=config.frame_use if earlier is None else earlier.frame_to_resume(),
+        frames=frames,
     )
     scene = prepared(scene, config, earlier)
     _check_scene(scene)

@@ -144,7 +144,7 @@ def _scene(services: Services, path: Path | None, run: Run | None, *, given: boo
     config = run.config if run else TrainConfig()
     frame = AS_IN_FILES if run is None else run.frame_for(path)
     try:
-        return services.load_scene(path, **config.scene_arguments(), frame=frame)
+        return services.load_scene(config, path, frame=frame)
     except (InputError, OSError) as error:
         if given:
             raise

@@ -454,11 +454,6 @@ class TrainConfig:
         """How the frame of the scene's files is changed."""
         return FrameUse("up" if self.orient == "up" else None, self.scale)
 
-    def scene_arguments(self) -> dict[str, Any]:
-        """Return the arguments of `load_scene` that settings give, by name; without `frame`, which a run keeps."""
-        same = ("resolution", "test_every", "test_most", "lenses", "missing")
-        return {**{name: getattr(self, name) for name in same}, "masks": self.mask_use}
-
     def rounds_photos(self, photographs: int) -> bool:
         """True if --photos rounds pixels to 8 bits per channel. photographs: number of training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)

@@ -26,7 +26,7 @@ from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_spec
 from clsplat.runs.run import Run
 from clsplat.scenes.folder_layouts import detect
-from clsplat.scenes.loading import load_scene
+from clsplat.scenes.loading import load_scene_of
 from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
 from clsplat.scenes.supervision.masks import after_sfm
@@ -77,14 +77,14 @@ def scene_of(run: Run) -> Scene | str:
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
-    arguments = run.config.scene_arguments()
+    masks = run.config.mask_use
     try:
         if detect(source) == "photos":
             source = reconstruction_folder(source.resolve())
             if not source.is_dir():
                 return "the scene is a folder of photos or a video, and its reconstruction no longer exists"
-            arguments["masks"] = after_sfm(arguments["masks"], source)
-        return load_scene(source, **arguments)
+            masks = after_sfm(masks, source)
+        return load_scene_of(run.config, source, masks=masks)
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"
 

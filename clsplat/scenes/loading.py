@@ -19,7 +19,7 @@ from clsplat.config.checks import misfit
 from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
-from clsplat.config.training import Lenses, Missing
+from clsplat.config.training import Lenses, Missing, TrainConfig
 from clsplat.errors import InputError, examples, plain, warn
 from clsplat.files.documents import digest
 from clsplat.images.reading import image_size
@@ -114,6 +114,34 @@ def load_scene(
             warn(doubt)
     scene.warnings = [plain(str(warning.message)) for warning in caught]
     return scene
+
+
+def load_scene_of(
+    config: TrainConfig,
+    path: str | Path,
+    *,
+    masks: MaskUse | None = None,
+    frame: FrameUse | SceneFrame = AS_IN_FILES,
+    frames: int | None = None,
+    progress: Progress | None = None,
+) -> Scene:
+    """Read a scene with the size, split, masks and lenses of a training's settings, as `load_scene` does.
+
+    masks: the meaning of masks and alpha channels; None for that of the settings.
+    Other arguments, errors and warnings are those of `load_scene`.
+    """
+    return load_scene(
+        path,
+        resolution=config.resolution,
+        test_every=config.test_every,
+        test_most=config.test_most,
+        lenses=config.lenses,
+        masks=config.mask_use if masks is None else masks,
+        missing=config.missing,
+        frame=frame,
+        frames=frames,
+        progress=progress,
+    )
 
 
 def _check_counts(**counts: int) -> None:

@@ -142,26 +142,22 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
 
     def load_scene(
+        config: TrainConfig,
         path: Path,
         *,
-        resolution: int,
-        test_every: int,
-        test_most: int,
-        masks: MaskUse,
-        lenses: str,
-        missing: str,
+        masks: MaskUse | None = None,
         frame: object,
         frames: int | None = None,
         progress: Callable[..., None],
     ) -> Any:
-        assert (masks, lenses, missing) == (NO_MASKS, "undistort", "few")
+        assert (masks or config.mask_use, config.lenses, config.missing) == (NO_MASKS, "undistort", "few")
         assert frames is None
         assert frame in (AS_IN_FILES, SOURCE_FRAME), "the run has no frame.json"
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")
-        pipe.calls.append(("load_scene", str(path), resolution, test_every))
+        pipe.calls.append(("load_scene", str(path), config.resolution, config.test_every))
         views = [FakeView("0.jpg", "test"), FakeView("1.jpg", "train")]
-        return Scene(views if test_every else views[1:], ["one photo is dark"])
+        return Scene(views if config.test_every else views[1:], ["one photo is dark"])
 
     def train(
         scene: Scene,
