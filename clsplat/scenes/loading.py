@@ -97,12 +97,7 @@ def load_scene(
     path = Path(path)
     _check_counts(resolution=resolution, test_every=test_every, test_most=test_most)
     kind = detect(path)
-    if frames is not None and kind != "photos":
-        raise InputError(f"--frames {frames}: {path} is a scene with cameras, expected a video or a folder with videos")
-    if images is not None and kind == "photos":
-        raise InputError(
-            f"{path}: is a folder of photos; another folder of images can be chosen only for a scene with cameras"
-        )
+    _check_kind(path, kind, images, frames)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         files = _reframed(_read(path, kind, images, missing, masks, work_dir, frames, progress), path, frame)
@@ -142,6 +137,16 @@ def load_scene_of(
         frames=frames,
         progress=progress,
     )
+
+
+def _check_kind(path: Path, kind: Kind, images: str | Path | None, frames: int | None) -> None:
+    """Raise InputError for arguments of `load_scene` that the layout `kind` does not have."""
+    if frames is not None and kind != "photos":
+        raise InputError(f"--frames {frames}: {path} is a scene with cameras, expected a video or a folder with videos")
+    if images is not None and kind == "photos":
+        raise InputError(
+            f"{path}: is a folder of photos; another folder of images can be chosen only for a scene with cameras"
+        )
 
 
 def _check_counts(**counts: int) -> None:

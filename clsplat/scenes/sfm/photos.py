@@ -103,18 +103,7 @@ def find_photos(
             elif extension in UNREADABLE_PHOTO_EXTENSIONS:
                 others.append(here / name)
     if not photos and needed:
-        kinds = " ".join(sorted(known))
-        if lacking:
-            found = f"{len(lacking)} photo(s) such as {min(lacking).name}"
-            raise InputError(f"{folder}: has only {found}, and reading them needs another package: {PHOTOS_EXTRA}")
-        unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
-        unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
-        unusable += (
-            f", only in {examples(sorted(photo_name(folder, path) for path in searched.made))}, {MADE_BY_CLSPLAT}"
-            if searched.made
-            else ""
-        )
-        raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
+        raise _no_photos(folder, lacking, others, broken, searched.made)
     key = partial(photo_name, folder)
     converted = set(without_converted([*photos, *lacking])[1])
     # also a photograph whose copy in the scene would have another photograph's name: a.webp beside a.webp.jpg
@@ -132,6 +121,25 @@ def find_photos(
         "their names mark masks, depth maps or the like of other photos": aside,
     }
     return sorted(kept, key=key), {why: sorted(paths, key=key) for why, paths in left_out.items() if paths}
+
+
+def _no_photos(
+    folder: Path, lacking: Sequence[Path], others: Sequence[Path], broken: Sequence[Path], made: Sequence[Path]
+) -> InputError:
+    """Return the error for a folder without photographs, which names what is there instead.
+
+    lacking: photographs whose decoder is not installed. others: photographs in unsupported formats.
+    broken: broken links. made: folders that clsplat made.
+    """
+    if lacking:
+        found = f"{len(lacking)} photo(s) such as {min(lacking).name}"
+        return InputError(f"{folder}: has only {found}, and reading them needs another package: {PHOTOS_EXTRA}")
+    unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
+    unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
+    if made:
+        unusable += f", only in {examples(sorted(photo_name(folder, path) for path in made))}, {MADE_BY_CLSPLAT}"
+    kinds = " ".join(sorted(SFM_PHOTO_EXTENSIONS | CONVERTED_PHOTO_EXTENSIONS))
+    return InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
 
 
 def _is_converted(path: Path) -> bool:
