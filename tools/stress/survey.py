@@ -78,7 +78,7 @@ class Survey:
         """Positions (own, 3) of a camera's points, relative to the foot of the camera, metres."""
         rng = np.random.default_rng(49)
         size = np.array([1.5 * STEP, 1.2 * ROW_STEP, 3.0])
-        return (rng.random((self.own, 3)) - np.array([0.5, 0.5, 0.0])) * size
+        return np.asarray((rng.random((self.own, 3)) - np.array([0.5, 0.5, 0.0])) * size)
 
     @cached_property
     def colours(self) -> NDArray[np.uint8]:
