@@ -183,6 +183,17 @@ def test_a_damaged_line_is_named_in_any_block(size: int, tmp_path: Path, monkeyp
             refuses(rf"points3D\.txt: line {number} does not read as POINT3D_ID", read_model, path.parent)
 
 
+def test_ids_of_any_length_in_tracks(tmp_path: Path) -> None:
+    """An image whose id is too large for an array is observed by nothing. Such an id in a track is damage."""
+    folder = write_model(tmp_path / "txt", "txt")
+    images, points = folder / "images.txt", folder / "points3D.txt"
+    images.write_text(images.read_text().replace("70000 1 0", f"{10**30} 1 0"))
+    assert sorted(read_tracks(folder).by_image) == ["0.png", "2.png", "3.png"]
+    lines = points.read_text().splitlines()
+    points.write_text("\n".join([*lines[:2], f"{lines[2]} {10**30} 0", *lines[3:]]))
+    refuses(r"points3D\.txt: line 3 does not read as POINT3D_ID", read_tracks, folder)
+
+
 def test_a_line_without_an_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_model(tmp_path / "txt", "txt")
     longest = max(len(line) for path in folder.iterdir() for line in path.read_text().splitlines())
@@ -215,8 +226,9 @@ def test_observations_that_are_not_needed_are_skipped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_memory_of_points_is_that_of_their_arrays(kind: str, tmp_path: Path) -> None:
-    folder, count = write_model(tmp_path / kind, kind), 200_000
+def test_memory_of_points_is_that_of_their_arrays(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, count, block = write_model(tmp_path / kind, kind), 50_000, 1 << 16
+    set_blocks(monkeypatch, block)
     record = struct.pack("<Q3d3BdQ", 1, 0.125, 2, 3, 4, 5, 6, 0.5, 4) + struct.pack("<8I", *range(8))
     if kind == "bin":
         (folder / "points3D.bin").write_bytes(struct.pack("<Q", count) + count * record)
@@ -224,8 +236,7 @@ def test_memory_of_points_is_that_of_their_arrays(kind: str, tmp_path: Path) -> 
         (folder / "points3D.txt").write_text(count * "1 0.125 2 3 4 5 6 0.5 0 1 2 3 4 5 6 7\n")
     # positions (24 bytes, a sixteenth more while they grow), levels twice (3), colours (12), masks (10), and blocks:
     # the file's bytes, lines and their words
-    blocks = 12 * colmap_files.TEXT_BLOCK_BYTES
-    assert calls.peak_of(lambda: read_model(folder)) < 60 * count + blocks
+    assert calls.peak_of(lambda: read_model(folder)) < 60 * count + 12 * block
 
 
 def test_words_are_counted_without_splitting() -> None:
