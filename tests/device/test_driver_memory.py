@@ -50,6 +50,7 @@ for number in range(25):
 """
 
 
+@pytest.mark.slow
 def test_processes_that_remember_at_once(elsewhere: Path) -> None:
     words = [[sys.executable, "-c", REMEMBER, name] for name in "ab"]
     begun = [subprocess.Popen(each) for each in words]
@@ -131,6 +132,7 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
     assert sum("is used instead" in str(each.message) for each in told) == 1
 
 
+@pytest.mark.slow
 def test_a_failure_is_forgotten_when_what_failed_works(
     standing: Standing, standing_device: Device, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

@@ -101,6 +101,7 @@ def test_a_program_without_kernels_is_built_anew(
     assert len(numbers.read_text().splitlines()) > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number", [1, pytest.param(4, marks=pytest.mark.slow), pytest.param(9, marks=pytest.mark.slow)]
 )
@@ -155,6 +156,7 @@ def test_what_the_system_kills_is_not_the_drivers_fault(
     assert not any(entry.failed for entry in driver_records.entries(standing_device.cl_device).values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how", [pytest.param("kill", marks=pytest.mark.skipif(os.name == "nt", reason="it has no signals")), "memory"]
 )

@@ -84,6 +84,7 @@ def test_nothing_is_lost(
     assert_same_arrays(resumed.arrays(), whole.arrays())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_read_that_fails(
     lost: bool, scene: Path, tmp_path: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch, whole: Gaussians

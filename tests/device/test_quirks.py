@@ -17,7 +17,10 @@ DRIVERS = re.compile(r"pocl|intel|rusticl|llvmpipe|\bmesa\b|nvidia|amd\b|ocl_icd
 
 def names(path: Path) -> list[str]:
     """Drivers' names in a file's code: its names and texts, not its comments and docstrings."""
-    tree = ast.parse(path.read_text("utf-8"))
+    text = path.read_text("utf-8")
+    if not DRIVERS.search(text):
+        return []
+    tree = ast.parse(text)
     documentation = {
         id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
     }

@@ -14,6 +14,7 @@ from calls import warnings_of
 from demo_photographs import photographs
 from numpy.typing import NDArray
 from PIL import Image as Pillow
+from quick import quick
 from scipy.ndimage import map_coordinates
 
 from clsplat.config.masks import MaskUse
@@ -201,7 +202,7 @@ def elsewhere() -> list[Picture]:
     return photographs(range(20, 20 + COUNT), WIDTH, HEIGHT)[0]
 
 
-@pytest.mark.parametrize("side", [WIDTH, 120])
+@pytest.mark.parametrize("side", quick([WIDTH, 120], 120))
 @pytest.mark.parametrize(
     "folders",
     [

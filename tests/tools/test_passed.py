@@ -90,6 +90,7 @@ def run(tmp_path: Path) -> Callable[..., set[str]]:
     return started
 
 
+@pytest.mark.slow
 def test_what_passed_is_left_out_and_nothing_else(run: Callable[..., set[str]], tmp_path: Path) -> None:
     first = run("-n", "2", "--dist", "loadgroup")
     assert first == FIRST | {"tests/test_drivers.py::test_of_all"}

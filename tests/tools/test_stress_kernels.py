@@ -30,6 +30,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 QUICK = settings(max_examples=4, deadline=None, derandomize=True, database=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STRESSORS)
 def test_projection_and_its_gradient_under(name: str, default_device: Device) -> None:
     stressor = STRESSORS[name]

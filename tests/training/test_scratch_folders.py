@@ -26,6 +26,7 @@ from clsplat.runs.scratch import ScratchFiles, owner_of
 pytestmark = pytest.mark.usefixtures("starts_wide")  # each training begins with a model of chunks
 
 
+@pytest.mark.slow
 def test_scratch_may_be_elsewhere(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
     """A resume with another folder takes the file's content there."""
     wanted = whole(STEADY)
@@ -50,6 +51,7 @@ def test_a_run_that_has_been_moved(go: Train, whole: Callable[[TrainConfig], byt
     assert go().model_path.read_bytes() == wanted
 
 
+@pytest.mark.slow
 def test_the_file_of_another_run_is_only_read(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
     """As after a copy of a run whose files are elsewhere."""
     wanted, scratch = whole(STEADY), tmp_path / "scratch"
