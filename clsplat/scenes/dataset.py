@@ -24,6 +24,7 @@ from clsplat.errors import InputError, examples
 from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
+from clsplat.scenes.geography.georeference import Georeference
 
 # If Ctrl-C interrupts its import, pycolmap says that it is not installed. It also sets a SIGTERM handler that prints a
 # stack trace. `undisturbed` prevents both.
@@ -254,6 +255,7 @@ class DataSet:
     box: corners (low, high) of instant-ngp's volume in world units; None for other data sets.
     missing: names of listed pictures that do not exist and are left out.
     clouds: point files that the data set does not name. The first one is used if `points` is empty.
+    georeference: where the data set lies on the earth; None if its files do not say it.
     """
 
     images: list[PosedImage]
@@ -262,6 +264,7 @@ class DataSet:
     box: tuple[Float64, Float64] | None = None
     missing: list[str] = field(default_factory=list)
     clouds: list[Path] = field(default_factory=list)
+    georeference: Georeference | None = None
 
 
 def check_lens(lens: Lens, where: str) -> Lens:

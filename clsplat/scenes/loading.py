@@ -27,7 +27,7 @@ from clsplat.models.edit import decompose
 from clsplat.progress import Progress
 from clsplat.scenes.camera_checks import camera_checks
 from clsplat.scenes.dataset import DataSet, Lens, PosedImage
-from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transforms
+from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_survey, read_transforms
 from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
@@ -67,7 +67,7 @@ def load_scene(
 ) -> Scene:
     """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
-    path: a folder in a layout that `detect` knows, a transforms.json, or a video.
+    path: a folder in a layout that `detect` knows, a transforms.json, a survey's file of cameras, or a video.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
     test_most: maximum number of held-out views. Of more, an even selection is held out. 0 for no maximum.
@@ -154,6 +154,8 @@ def _read(
     """
     if kind in ("blender", "transforms"):
         return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
+    if kind == "survey":
+        return _SceneFiles(read_survey(path, images, missing), path, (), masks)
     folder = path
     if kind == "photos":
         photos = path.resolve()
@@ -227,7 +229,7 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
         scene.bounds = shift - scale * cube, shift + scale * cube
     if len(scene.points) == 0:
         scene = with_cloud_beside(scene)
-        if not len(scene.points) and kind in ("colmap", "photos"):
+        if not len(scene.points) and kind in ("colmap", "survey", "photos"):
             warn(f"{path}: has no points; training starts from random points")
     if kind != "blender":
         near = [view.camera for view in views if view.name not in scene.stray_cameras]

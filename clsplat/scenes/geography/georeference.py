@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""georeference.json, the record of where a scene lies on the earth: a coordinate reference system and a similarity.
+
+The file lies beside the cameras of a scene, where users may write it, and in the folder of a run (docs/conventions.md).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.arrays import Float64, numbers
+from clsplat.errors import InputError
+from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import is_file, parse_json, read_document
+
+GEOREFERENCE_FILE = "georeference.json"
+"""Name of the record's file."""
+MAX_GEOREFERENCE_BYTES = 1 << 20
+"""Size limit of georeference.json in bytes."""
+GEOCENTRIC_EPSG = 4978
+"""EPSG code of WGS 84 geocentric coordinates (x, y, z in metres from the earth's centre)."""
+GEOCENTRIC_EPSG_CODES = (GEOCENTRIC_EPSG, 4936)
+"""Codes of geocentric systems among GEOGRAPHIC_EPSG_CODES. Their coordinates are metres."""
+GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
+"""EPSG codes whose coordinates are latitude and longitude in degrees, except for GEOCENTRIC_EPSG_CODES."""
+MAX_EPSG_CODE = 1_000_000
+"""Limit of EPSG codes."""
+SIMILARITY_SLACK = 1e-6
+"""Largest relative deviation of a transform from a rotation times a scale. Numbers with 7 digits deviate by less."""
+_EXPECTED_GEOREFERENCE = "the record of where a scene lies on the earth"
+
+
+@dataclass(frozen=True)
+class GpsResiduals:
+    """Distances in metres between the cameras and the GPS positions of their photographs.
+
+    count: number of photographs with a GPS position.
+    rms, largest: root mean square and maximum of the distances.
+    """
+
+    count: int
+    rms: float
+    largest: float
+
+    @classmethod
+    def of(cls, distances: Float64) -> GpsResiduals | None:
+        """Summarise distances (N,); None for none."""
+        if not len(distances):
+            return None
+        return cls(len(distances), float(np.sqrt(np.mean(distances**2))), float(distances.max()))
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """Position of a scene on the earth: crs = origin + transform @ p, for points p in the scene's source frame.
+
+    The source frame is the one that the cameras had first (`SceneFrame`).
+
+    epsg: code of the coordinate reference system, whose coordinates are in metres. 4978 is geocentric.
+    origin: (3,), coordinates of the source frame's origin in the reference system.
+    transform: (3, 3), rotation times scale from the source frame to the reference system.
+    residuals: distances of the cameras from GPS positions; None if these are unknown.
+    note: what the georeference comes from, for the user.
+    """
+
+    epsg: int
+    origin: Float64 = field(default_factory=lambda: np.zeros(3))
+    transform: Float64 = field(default_factory=lambda: np.eye(3))
+    residuals: GpsResiduals | None = None
+    note: str = ""
+
+    @property
+    def crs_from_source(self) -> Float64:
+        """The similarity as a matrix (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.transform, self.origin
+        return matrix
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of georeference.json."""
+        known = self.residuals
+        residuals = None if known is None else {"photographs": known.count, "rms": known.rms, "max": known.largest}
+        return {
+            "epsg": self.epsg,
+            "origin": self.origin.tolist(),
+            "transform": self.transform.tolist(),
+            "gps_residuals": residuals,
+            "note": self.note,
+        }
+
+
+def on_tangent_plane(place: tuple[float, float, float], note: str, residuals: GpsResiduals | None) -> Georeference:
+    """Return the georeference of a frame with x east, y north and z up, in metres, from a place on WGS 84.
+
+    place: latitude and longitude in degrees, and altitude in metres.
+    """
+    latitude, longitude = np.deg2rad(place[:2])
+    east = [-np.sin(longitude), np.cos(longitude), 0.0]
+    north = [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
+    up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    return Georeference(GEOCENTRIC_EPSG, geocentric_of(place), np.array([east, north, up]).T, residuals, note)
+
+
+def geocentric_of(place: tuple[float, float, float]) -> Float64:
+    """Return geocentric coordinates (3,) of latitude and longitude in degrees and altitude in metres, on WGS 84."""
+    import pycolmap
+
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.ellipsoid_to_ecef(np.array([place], np.float64))[0], np.float64)
+
+
+def place_of(geocentric: Float64) -> tuple[float, float, float]:
+    """Return latitude and longitude in degrees and altitude in metres on WGS 84, of geocentric coordinates (3,)."""
+    import pycolmap
+
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    latitude, longitude, altitude = transform.ecef_to_ellipsoid(np.asarray(geocentric, np.float64)[None])[0].tolist()
+    return latitude, longitude, altitude
+
+
+def write_georeference(folder: Path, georeference: Georeference) -> None:
+    """Write georeference.json into a folder."""
+    text = json.dumps(georeference.document(), indent=2) + "\n"
+    atomic_write(folder / GEOREFERENCE_FILE, text.encode())
+
+
+def read_georeference(folder: Path) -> Georeference | None:
+    """Read georeference.json of a folder; None if there is no such file.
+
+    Only `epsg` is required. Without `origin` and `transform` the scene's coordinates are those of the reference system.
+    Raises InputError for a damaged file, and for a reference system in degrees.
+    """
+    path = folder / GEOREFERENCE_FILE
+    if not is_file(path):
+        return None
+    try:
+        document = parse_json(read_document(path, _EXPECTED_GEOREFERENCE, MAX_GEOREFERENCE_BYTES), once=True)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected {_EXPECTED_GEOREFERENCE}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: is not a JSON object, expected one with 'epsg'")
+    origin, transform = (document.get(key) for key in ("origin", "transform"))
+    place = np.zeros(3) if origin is None else numbers(origin)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(f"{path}: 'origin' is {str(origin)[:60]}, expected three numbers")
+    axes = np.eye(3) if transform is None else numbers(transform)
+    if not _is_similarity(axes):
+        raise InputError(
+            f"{path}: 'transform' is {str(transform)[:60]}, expected 3 x 3 numbers: a rotation times a scale"
+        )
+    note = document.get("note")
+    residuals = _residuals(document.get("gps_residuals"))
+    return Georeference(
+        _epsg(path, document.get("epsg")), place, axes, residuals, note if isinstance(note, str) else ""
+    )
+
+
+def _epsg(path: Path, code: Any) -> int:
+    if isinstance(code, bool) or not isinstance(code, int) or not 0 < code < MAX_EPSG_CODE:
+        raise InputError(
+            f"{path}: 'epsg' is {str(code)[:60]}, expected the whole number of an EPSG code, such as 32632"
+        )
+    if code in GEOGRAPHIC_EPSG_CODES and code not in GEOCENTRIC_EPSG_CODES:
+        raise InputError(
+            f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "
+            "zone; export the cameras again in such a system"
+        )
+    return code
+
+
+def _residuals(given: Any) -> GpsResiduals | None:
+    values = numbers([given.get(key) for key in ("photographs", "rms", "max")] if isinstance(given, dict) else None)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        return None
+    return GpsResiduals(int(values[0]), float(values[1]), float(values[2]))
+
+
+def _is_similarity(axes: Float64) -> bool:
+    if axes.shape != (3, 3) or not np.isfinite(axes).all():
+        return False
+    squares = axes.T @ axes
+    size = float(np.trace(squares)) / 3
+    return bool(
+        size > 0 and np.linalg.det(axes) > 0 and np.abs(squares - size * np.eye(3)).max() <= SIMILARITY_SLACK * size
+    )

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of survey formats: how the file of cameras is found, and which reader reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from clsplat.errors import InputError
+from clsplat.files.documents import is_file
+from clsplat.scenes.dataset import DataSet, PosedImage
+from clsplat.scenes.readers.surveys.opensfm import (
+    EXPECTED_RECONSTRUCTION,
+    OPENSFM_FOLDER,
+    find_reconstruction,
+    is_reconstruction,
+    read_reconstruction,
+)
+
+MAX_SPREAD_DEGREES = 0.5
+"""Largest extent, along x and y, of positions that may be degrees of longitude and latitude."""
+MIN_HEIGHT_PER_DEGREE = 300.0
+"""Smallest ratio of the extents along z and in x and y of positions that count as metres over degrees. For a flight
+with a kilometre to each metre of height it is 111."""
+
+
+@dataclass(frozen=True)
+class SurveyFormat:
+    """A format of survey cameras.
+
+    name: the file in words, for messages.
+    find: function that returns the path of the file in a scene's folder; None if there is none.
+    is_one: function that returns True for a file of this format.
+    read: function that reads the file. The images have no paths.
+    """
+
+    name: str
+    find: Callable[[Path], Path | None]
+    is_one: Callable[[Path], bool]
+    read: Callable[[Path], DataSet]
+
+
+SURVEY_FORMATS = (SurveyFormat(EXPECTED_RECONSTRUCTION, find_reconstruction, is_reconstruction, read_reconstruction),)
+"""Every survey format, in the order in which a folder is searched."""
+SURVEY_FILES = " or ".join(row.name for row in SURVEY_FORMATS)
+"""The files in words, for messages."""
+
+
+class Survey(NamedTuple):
+    """The cameras of a survey.
+
+    cameras: the file.
+    read: function that reads the file.
+    top: folder of the scene, in which the photographs are searched.
+    """
+
+    cameras: Path
+    read: Callable[[Path], DataSet]
+    top: Path
+
+    def images(self) -> list[PosedImage]:
+        """Read the images, sorted by name. Photographs need not exist, unless their sizes are not in the file."""
+        return sorted(self.read(self.cameras).images, key=lambda image: image.name)
+
+
+def survey_of(path: Path) -> Survey | None:
+    """Return the survey's cameras in a folder, or the given file of cameras; None if there are none."""
+    for row in SURVEY_FORMATS:
+        cameras = (path if row.is_one(path) else None) if is_file(path) else row.find(path)
+        if cameras is not None:
+            folder = cameras.parent if is_file(cameras) else cameras
+            of_project = folder.name == OPENSFM_FOLDER and not (folder / "images").is_dir()
+            return Survey(cameras, row.read, folder.parent if of_project else folder)
+    return None
+
+
+def check_units(path: Path, images: Sequence[PosedImage]) -> None:
+    """Raise InputError if the cameras' positions are longitudes and latitudes in degrees, with heights in metres.
+
+    path: the file of cameras, for the message.
+    """
+    centres = np.stack([-image.rotation.T @ image.translation for image in images])
+    extent = np.ptp(centres, axis=0)
+    across = float(extent[:2].max())
+    on_globe = bool((np.abs(centres[:, 0]) <= 360).all() and (np.abs(centres[:, 1]) <= 90).all())
+    if on_globe and 0 < across < MAX_SPREAD_DEGREES and extent[2] > MIN_HEIGHT_PER_DEGREE * across:
+        x, y, z = centres[0].tolist()
+        raise InputError(
+            f"{path}: the positions look like degrees with heights in metres (the first is {x:.6g} {y:.6g} {z:.6g}), "
+            "expected metres; export the cameras in a local or projected coordinate system, such as a UTM zone"
+        )

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of survey programs: the same scene in each format, far from the world's origin, and files that are wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ring
+import survey_files
+from calls import refusal, refuses, warned
+
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.readers.surveys.opensfm import read_reconstruction
+from clsplat.scenes.scene import Scene
+from clsplat.shots.read import photographed, read_shot
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "opensfm": lambda folder: survey_files.write_opensfm(folder, survey_files.at(), offset=survey_files.UTM_OFFSET),
+}
+POINTLESS = ("xmp",)
+"""Formats without points."""
+
+
+def colmap_scene(folder: Path) -> Scene:
+    xyz, rgb = ring.points()
+    ring.write_colmap(folder, posed=survey_files.at(), cloud=(xyz + survey_files.UTM_OFFSET, rgb))
+    return load_scene(folder)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_cameras_at_a_utm_origin_equal_colmaps(tmp_path: Path, kind: str) -> None:
+    wanted = colmap_scene(tmp_path / "colmap")
+    WRITERS[kind](tmp_path / kind)
+    found = load_scene(tmp_path / kind)
+    assert [view.name for view in found.views] == [view.name for view in wanted.views]
+    assert [view.split for view in found.views] == [view.split for view in wanted.views]
+    for view, other in zip(found.views, wanted.views, strict=True):
+        # 1e-6 m of 5.4e6 m: float64 keeps 1e-9 there, float32 half a metre
+        np.testing.assert_allclose(view.camera.position, other.camera.position, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(view.camera.rotation, other.camera.rotation, rtol=0, atol=1e-12)
+        lens = [view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy]
+        np.testing.assert_allclose(
+            lens, [other.camera.fx, other.camera.fy, other.camera.cx, other.camera.cy], rtol=0, atol=1e-6
+        )
+    np.testing.assert_array_equal(found.origin, wanted.origin)
+    if kind not in POINTLESS:
+        np.testing.assert_allclose(found.points, wanted.points, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.point_colors, wanted.point_colors, rtol=0, atol=1e-6)
+
+
+# OpenSfM
+
+
+LENGTH = max(ring.WIDTH, ring.HEIGHT)
+BROWN = {"projection_type": "brown", "focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": -0.02}
+
+
+@pytest.mark.parametrize(
+    ("camera", "model", "params"),
+    [
+        ({"focal": 0.8}, "PINHOLE", (38.4, 38.4, 24, 16)),
+        ({"focal": 0.8, "k1": 0.1, "k2": -0.02}, "OPENCV", (38.4, 38.4, 24, 16, 0.1, -0.02, 0, 0)),
+        ({**BROWN, "k1": 0.1, "p1": 0.01, "p2": 0.02}, "OPENCV", (38.4, 43.2, 24.48, 15.04, 0.1, 0, 0.01, 0.02)),
+        ({**BROWN, "k3": 0.3}, "FULL_OPENCV", (38.4, 43.2, 24.48, 15.04, 0, 0, 0, 0, 0.3, 0, 0, 0)),
+        (
+            {"projection_type": "fisheye", "focal": 0.5, "k1": 0.1, "k2": 0.2},
+            "OPENCV_FISHEYE",
+            (24, 24, 24, 16, 0.1, 0.2, 0, 0),
+        ),
+        (
+            {**BROWN, "projection_type": "fisheye_opencv", "k4": 0.4},
+            "OPENCV_FISHEYE",
+            (38.4, 43.2, 24.48, 15.04, 0, 0, 0, 0.4),
+        ),
+        ({"projection_type": "spherical", "width": 64, "height": 32}, "EQUIRECTANGULAR", (64, 32)),
+    ],
+)
+def test_lenses_of_opensfm(tmp_path: Path, camera: dict[str, Any], model: str, params: tuple[float, ...]) -> None:
+    lens = read_reconstruction(survey_files.write_opensfm(tmp_path, camera=camera)).images[0].lens
+    assert lens.model == model
+    assert lens.params == pytest.approx(params)
+
+
+def test_the_lens_follows_opensfms_formula(tmp_path: Path) -> None:
+    """The formula of its documentation, u = f (1 + k1 r^2 + k2 r^4) x / z, as a fraction of the longer side."""
+    path = survey_files.write_opensfm(tmp_path, camera={"focal": 0.8, "k1": 0.1, "k2": -0.05})
+    x, y, z = 0.3, -0.2, 1.5
+    square = (x * x + y * y) / z**2
+    factor = 0.8 * (1 + 0.1 * square - 0.05 * square**2) / z
+    wanted = [LENGTH * factor * x + ring.WIDTH / 2, LENGTH * factor * y + ring.HEIGHT / 2]
+    lens = read_reconstruction(path).images[0].lens
+    np.testing.assert_allclose(lens.img_from_cam(np.array([[x, y, z]]))[0], wanted, rtol=1e-12)
+
+
+def test_a_project_of_webodm_is_read_from_its_folder(tmp_path: Path) -> None:
+    survey_files.write_opensfm(tmp_path)
+    (tmp_path / "opensfm").mkdir()
+    (tmp_path / "reconstruction.json").rename(tmp_path / "opensfm" / "reconstruction.json")
+    for path in (tmp_path, tmp_path / "opensfm", tmp_path / "opensfm" / "reconstruction.json"):
+        assert len(load_scene(path).views) == ring.COUNT
+
+
+def test_the_largest_of_several_reconstructions_is_used(tmp_path: Path) -> None:
+    path = survey_files.write_opensfm(tmp_path)
+    (part,) = json.loads(path.read_text())
+    few = {**part, "shots": dict(list(part["shots"].items())[:3])}
+    path.write_text(json.dumps([few, part, {"shots": {}}]))
+    data = warned("holds 2 reconstructions .* most photographs is used .20., without 3", read_reconstruction, path)
+    assert len(data.images) == ring.COUNT
+
+
+def test_the_place_of_a_reconstruction_is_its_georeference(tmp_path: Path) -> None:
+    place = {"latitude": 0.0, "longitude": 90.0, "altitude": 100.0}
+    path = survey_files.write_opensfm(tmp_path, reference_lla=place)
+    (part,) = json.loads(path.read_text())
+    for index, pose in enumerate(ring.poses()):
+        shot = part["shots"][ring.NAMES[index]]
+        shot["gps_position"] = np.add(ring.centre_of(pose), [3.0, 0, 4.0]).tolist()
+        shot["gps_dop"] = 999999.0 if index >= 10 else 5.0
+    path.write_text(json.dumps([part]))
+    found = read_reconstruction(path).georeference
+    assert found is not None
+    assert found.epsg == 4978
+    # At longitude 90 on the equator, up is y, east is -x and north is z of the geocentric system.
+    np.testing.assert_allclose(found.origin, [0, 6378137.0 + 100, 0], atol=1e-6)
+    np.testing.assert_allclose(found.transform, [[-1, 0, 0], [0, 0, 1], [0, 1, 0]], atol=1e-12)
+    assert found.residuals is not None
+    assert (found.residuals.count, found.residuals.rms) == (10, pytest.approx(5.0))
+    path.write_text(json.dumps([{key: value for key, value in part.items() if key != "reference_lla"}]))
+    assert read_reconstruction(path).georeference is None
+    (tmp_path / "reference_lla.json").write_text(json.dumps(place))
+    beside = read_reconstruction(path).georeference
+    assert beside is not None
+    np.testing.assert_array_equal(beside.origin, found.origin)
+
+
+def change_shot(part: dict[str, Any], **keys: Any) -> None:
+    part["shots"][ring.NAMES[1]].update(keys)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda part: change_shot(part, camera="v2 b"), "photograph 'view01.png': its camera 'v2 b' is not among"),
+        (
+            lambda part: change_shot(part, rotation=[1, 2]),
+            "photograph 'view01.png': 'rotation' is .* list of 3 numbers",
+        ),
+        (lambda part: change_shot(part, translation=None), "photograph 'view01.png': has no 'translation'"),
+        (lambda part: change_shot(part, translation=[1e31, 0, 0]), "'translation' is .* possible size"),
+        (lambda part: part["cameras"]["v2 a"].update(projection_type="dual"), "the lens is 'dual', expected persp"),
+        (lambda part: part["cameras"]["v2 a"].update(width=0), "'width' is 0, expected a whole number"),
+        (lambda part: part["cameras"]["v2 a"].update(focal=-1), "focal lengths above 0"),
+        (
+            lambda part: part["cameras"]["v2 a"].update(projection_type="brown", focal_x=1, focal_y=1, k4=0.5),
+            "k4 = 0.5 .* undistorted",
+        ),
+        (lambda part: part["points"]["0"].update(coordinates=[1, "x", 2]), "the points' 'coordinates' are not all"),
+        (lambda part: part.update(points=[]), "'points' is .*, expected a JSON object"),
+        (lambda part: part.update(shots={}), "has no 'shots'"),
+        (lambda part: part.update(reference_lla={"latitude": 95, "longitude": 0, "altitude": 0}), "'latitude' is 95"),
+        (lambda part: part.update(reference_lla=[1, 2, 3]), "expected latitude, longitude and altitude"),
+    ],
+)
+def test_a_wrong_reconstruction_is_one_line(tmp_path: Path, change: Callable[[Any], object], told: str) -> None:
+    path = survey_files.write_opensfm(tmp_path)
+    (part,) = json.loads(path.read_text())
+    change(part)
+    path.write_text(json.dumps([part]))
+    refuses(f"reconstruction.json.*{told}", read_reconstruction, path)
+
+
+@pytest.mark.parametrize(("text", "told"), [("[", "is not JSON"), ("{}", "not a list"), ("[1]", "not a list")])
+def test_a_file_that_is_no_reconstruction_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+    path = survey_files.write_opensfm(tmp_path)
+    path.write_text(text)
+    refuses(told, read_reconstruction, path)
+
+
+# Any format
+
+
+def test_a_missing_photograph_is_named(tmp_path: Path) -> None:
+    survey_files.write_opensfm(tmp_path)
+    (tmp_path / "images" / ring.NAMES[3]).unlink()
+    scene = load_scene(tmp_path)
+    assert scene.missing == (ring.NAMES[3],)
+    assert any("lists 1 image(s) that are missing" in text for text in scene.warnings)
+
+
+def test_positions_in_degrees_are_refused(tmp_path: Path) -> None:
+    centres = [
+        np.array([11.5 + 1e-4 * x, 48.1 + 1e-4 * z, 500 - 10 * y]) for x, y, z in map(ring.centre_of, ring.poses())
+    ]
+    posed = [ring.moved(pose, centre) for pose, centre in zip(ring.poses(), centres, strict=True)]
+    survey_files.write_opensfm(tmp_path, posed)
+    told = refusal(lambda: load_scene(tmp_path))
+    assert "look like degrees with heights in metres" in told
+    assert "UTM" in told
+
+
+def test_the_cameras_are_a_shot(tmp_path: Path) -> None:
+    """For `render --cameras` and its lenses; without the photographs."""
+    path = survey_files.write_opensfm(tmp_path, camera={"focal": 0.8, "k1": 0.1})
+    for name in ring.NAMES:
+        (tmp_path / "images" / name).unlink()
+    for source in (path, tmp_path):
+        shot = read_shot(source)
+        assert [frame.name for frame in shot.frames] == ring.NAMES
+        np.testing.assert_allclose(shot.frames[3].camera.rotation, ring.poses()[3][0], atol=1e-12)
+        assert photographed(source)[0].lens.model == "OPENCV"
