@@ -19,7 +19,7 @@ from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_p
 from clsplat.scenes.photo_names import legible, match
 from clsplat.scenes.point_files import clouds_beside
 from clsplat.scenes.readers import colmap, transforms
-from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, check_units, survey_of
+from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, check_names, check_units, survey_of
 from clsplat.scenes.sfm.video_frames import find_videos
 from clsplat.scenes.sidecar_files import inside
 from clsplat.scenes.video.reading import is_video_name
@@ -110,25 +110,30 @@ def read_survey(path: Path, chosen: str | Path | None, missing: Missing) -> Data
     assert found is not None  # `detect` has checked this
     cameras, top = found.cameras, found.top
     data = found.read(cameras)
+    check_names(cameras, data.images)
     check_units(cameras, data.images)
-    _add_pictures(data, _picture_folder(top, chosen, cameras, data.images), cameras, missing)
+    folder = _picture_folder(top, chosen, cameras, data.images)
+    _add_pictures(data, folder, cameras, missing, labels=True)
     data.images = _held_out(data, top / HELD_OUT_LIST_FILE)
     data.clouds = clouds_beside(list(dict.fromkeys([cameras.parent, top])))
     return data
 
 
-def _add_pictures(data: DataSet, folder: Path, listed_in: Path, missing: Missing) -> None:
+def _add_pictures(data: DataSet, folder: Path, listed_in: Path, missing: Missing, *, labels: bool = False) -> None:
     """Set the path of each image, and leave out images without a picture. Warns of pictures that are not listed.
 
     folder: the folder with the pictures.
     listed_in: the file or folder with the cameras, for messages.
     missing: how many pictures may be missing, as for `find_pictures`.
+    labels: True if names without an extension are usual, so that they need no warning.
     """
     present = find_images(folder)
     if not present:
         raise InputError(f"{folder}: no images found, expected the {len(data.images)} images of {listed_in}")
     listed = [image.name for image in data.images]
-    files = find_pictures(listed, [folder / name for name in listed], folder, listed_in, missing, present)
+    labelled = {path.relative_to(folder).with_suffix("").as_posix(): path for path in present} if labels else {}
+    exact = [labelled.get(name, folder / name) for name in listed]
+    files = find_pictures(listed, exact, folder, listed_in, missing, present)
     names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
     posed = zip(data.images, names, files, strict=True)
     data.images = [

@@ -224,6 +224,7 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
     scene.missing = tuple(data.missing)
     scene.frame, scene.world_from_files = files.frame, files.world_from_files
+    scene.georeference = data.georeference
     if files.world_from_files is not None:
         scale, _, shift = decompose(files.world_from_files)
         scene.bounds = shift - scale * cube, shift + scale * cube

@@ -23,6 +23,7 @@ from clsplat.errors import InputError, reason_of
 from clsplat.files.documents import short_digest
 from clsplat.images.reading import downscale, read_image
 from clsplat.scenes.dataset import Lens, pixels_of, undistort
+from clsplat.scenes.geography.georeference import Georeference
 from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.supervision.depth_samples import KnownDepth
@@ -197,6 +198,7 @@ class Scene:
     unit: the length unit in world units (`scenes.depth_sources`); None for the extent.
     frame: the frame of the scene, relative to the frame that its cameras had first.
     world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
+    georeference: where the scene's source frame lies on the earth; None if it is unknown.
     """
 
     name: str
@@ -214,6 +216,7 @@ class Scene:
     unit: float | None = None
     frame: SceneFrame = SOURCE_FRAME
     world_from_files: Float64 | None = None
+    georeference: Georeference | None = None
 
     @cached_property
     def train_views(self) -> list[View]:

@@ -61,3 +61,58 @@ def write_opensfm(
     path = folder / "reconstruction.json"
     path.write_text(json.dumps([part]))
     return path
+
+
+def write_metashape(
+    folder: Path,
+    posed: Sequence[ring.Pose] | None = None,
+    names: Sequence[str] = ring.NAMES,
+    *,
+    world_from_chunk: Float64 | None = None,
+    reference: str = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]',
+    calibration: str = f"<f>{ring.FOCAL}</f><cx>0</cx><cy>0</cy>",
+    kind: str = "frame",
+) -> Path:
+    """Write cameras.xml with pictures in images/. Returns its path.
+
+    names: names of the pictures' files. The labels are these names without their extension.
+    world_from_chunk: (4, 4), similarity of the component; none by default.
+    reference: the chunk's coordinate system as WKT.
+    calibration: elements of the calibration.
+    kind: type of the sensor.
+    """
+    ring.write_pictures(folder / "images", names)
+    move = np.eye(4) if world_from_chunk is None else world_from_chunk
+    scale = np.cbrt(np.linalg.det(move[:3, :3]))
+    turn = move[:3, :3] / scale
+    cameras = []
+    for index, (name, pose) in enumerate(zip(names, posed or ring.poses(), strict=True)):
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn.T @ pose[0].T
+        matrix[:3, 3] = turn.T @ (ring.centre_of(pose) - move[:3, 3]) / scale
+        text = " ".join(map(repr, matrix.ravel().tolist()))
+        cameras.append(
+            f'<camera id="{index}" sensor_id="0" component_id="0" label="{Path(name).stem}">'
+            f"<transform>{text}</transform><orientation>1</orientation></camera>"
+        )
+    parts = zip(("rotation", "translation", "scale"), (turn, move[:3, 3], np.array(scale)), strict=True)
+    transform = "".join(f"<{part}>{' '.join(map(repr, value.ravel().tolist()))}</{part}>" for part, value in parts)
+    sides = f'<resolution width="{ring.WIDTH}" height="{ring.HEIGHT}"/>'
+    path = folder / "cameras.xml"
+    path.write_text(
+        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0">\n<chunk label="Chunk 1" enabled="true">'
+        f'<sensors next_id="1"><sensor id="0" label="a" type="{kind}">{sides}'
+        f'<calibration type="{kind}" class="adjusted">{sides}{calibration}</calibration></sensor></sensors>\n'
+        f'<components><component id="0" label="a"><transform>{transform}</transform></component></components>\n'
+        f'<cameras><group id="0" label="Group 1" type="folder">{"".join(cameras[:5])}</group>{"".join(cameras[5:])}'
+        f"</cameras>\n<reference>{reference}</reference>\n</chunk>\n</document>\n"
+    )
+    return path
+
+
+def chunk_at(offset: Float64 = UTM_OFFSET) -> Float64:
+    """A similarity (4, 4) from a chunk with another scale and other axes to a world at `offset`."""
+    move = np.eye(4)
+    move[:3, :3] = 12.5 * Rotation.from_euler("xyz", [30, -50, 70], degrees=True).as_matrix()
+    move[:3, 3] = offset
+    return move

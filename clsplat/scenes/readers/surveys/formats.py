@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.files.documents import is_file
 from clsplat.scenes.dataset import DataSet, PosedImage
+from clsplat.scenes.readers.surveys.metashape import EXPECTED_METASHAPE, find_metashape, is_metashape, read_metashape
 from clsplat.scenes.readers.surveys.opensfm import (
     EXPECTED_RECONSTRUCTION,
     OPENSFM_FOLDER,
@@ -44,7 +46,10 @@ class SurveyFormat:
     read: Callable[[Path], DataSet]
 
 
-SURVEY_FORMATS = (SurveyFormat(EXPECTED_RECONSTRUCTION, find_reconstruction, is_reconstruction, read_reconstruction),)
+SURVEY_FORMATS = (
+    SurveyFormat(EXPECTED_RECONSTRUCTION, find_reconstruction, is_reconstruction, read_reconstruction),
+    SurveyFormat(EXPECTED_METASHAPE, find_metashape, is_metashape, read_metashape),
+)
 """Every survey format, in the order in which a folder is searched."""
 SURVEY_FILES = " or ".join(row.name for row in SURVEY_FORMATS)
 """The files in words, for messages."""
@@ -76,6 +81,16 @@ def survey_of(path: Path) -> Survey | None:
             of_project = folder.name == OPENSFM_FOLDER and not (folder / "images").is_dir()
             return Survey(cameras, row.read, folder.parent if of_project else folder)
     return None
+
+
+def check_names(path: Path, images: Sequence[PosedImage]) -> None:
+    """Raise InputError if two cameras have the same photograph. path: the file of cameras, for the message."""
+    twice = [name for name, count in Counter(image.name for image in images).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"{path}: lists {examples(twice)} twice, expected each photograph once; give the photographs different "
+            "names and export the cameras again"
+        )
 
 
 def check_units(path: Path, images: Sequence[PosedImage]) -> None:
