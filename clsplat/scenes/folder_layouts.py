@@ -19,7 +19,7 @@ from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_p
 from clsplat.scenes.photo_names import legible, match
 from clsplat.scenes.point_files import clouds_beside
 from clsplat.scenes.readers import colmap, transforms
-from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, check_names, check_units, survey_of
+from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, survey_of
 from clsplat.scenes.sfm.video_frames import find_videos
 from clsplat.scenes.sidecar_files import inside
 from clsplat.scenes.video.reading import is_video_name
@@ -109,10 +109,11 @@ def read_survey(path: Path, chosen: str | Path | None, missing: Missing) -> Data
     found = survey_of(path)
     assert found is not None  # `detect` has checked this
     cameras, top = found.cameras, found.top
-    data = found.read(cameras)
-    check_names(cameras, data.images)
-    check_units(cameras, data.images)
-    folder = _picture_folder(top, chosen, cameras, data.images)
+    if chosen is not None and not (top / chosen).is_dir():
+        raise InputError(f"{top / chosen}: no such folder, expected the photographs of {cameras}")
+    data = found.read(None if chosen is None else top / chosen)
+    beside = found.format.is_folder and chosen is None
+    folder = top if beside else _picture_folder(top, chosen, cameras, data.images)
     _add_pictures(data, folder, cameras, missing, labels=True)
     data.images = _held_out(data, top / HELD_OUT_LIST_FILE)
     data.clouds = clouds_beside(list(dict.fromkeys([cameras.parent, top])))

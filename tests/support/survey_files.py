@@ -116,3 +116,32 @@ def chunk_at(offset: Float64 = UTM_OFFSET) -> Float64:
     move[:3, :3] = 12.5 * Rotation.from_euler("xyz", [30, -50, 70], degrees=True).as_matrix()
     move[:3, 3] = offset
     return move
+
+
+def write_xmp(
+    folder: Path,
+    posed: Sequence[ring.Pose] | None = None,
+    names: Sequence[str] = ring.NAMES,
+    *,
+    attributes: str = 'xcr:DistortionModel="perspective" xcr:DistortionCoeficients="0 0 0 0 0 0"',
+    more: str = "",
+) -> Path:
+    """Write pictures with RealityScan's XMP files beside them. Returns the folder.
+
+    attributes: attributes of the distortion, and others.
+    more: elements after those of the pose.
+    """
+    ring.write_pictures(folder, names)
+    for name, pose in zip(names, posed or ring.poses(), strict=True):
+        rotation, position = (" ".join(map(repr, each.ravel().tolist())) for each in (pose[0], ring.centre_of(pose)))
+        focal = 36 * ring.FOCAL / max(ring.WIDTH, ring.HEIGHT)
+        (folder / name).with_suffix(".xmp").write_text(
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
+            '    <rdf:Description xcr:Version="4" xcr:ExportCoordinateSystemType="3" xcr:PosePrior="initial"\n'
+            f'       xcr:Coordinates="absolute" {attributes} xcr:FocalLength35mm="{focal!r}"\n'
+            '       xcr:AspectRatio="1" xcr:PrincipalPointU="0" xcr:PrincipalPointV="0"\n'
+            '       xcr:CalibrationGroup="-1" xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">\n'
+            f"      <xcr:Rotation>{rotation}</xcr:Rotation>\n      <xcr:Position>{position}</xcr:Position>{more}\n"
+            "    </rdf:Description>\n  </rdf:RDF>\n</x:xmpmeta>\n"
+        )
+    return folder

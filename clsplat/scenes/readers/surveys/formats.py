@@ -22,6 +22,7 @@ from clsplat.scenes.readers.surveys.opensfm import (
     is_reconstruction,
     read_reconstruction,
 )
+from clsplat.scenes.readers.surveys.realityscan import XMP_FILES, find_xmp, read_xmp
 
 MAX_SPREAD_DEGREES = 0.5
 """Largest extent, along x and y, of positions that may be degrees of longitude and latitude."""
@@ -37,18 +38,24 @@ class SurveyFormat:
     name: the file in words, for messages.
     find: function that returns the path of the file in a scene's folder; None if there is none.
     is_one: function that returns True for a file of this format.
-    read: function that reads the file. The images have no paths.
+    read: function of the file, and of the folder of photographs that the user gave or None, which reads the file. The
+        images have no paths.
+    is_folder: True if the cameras are in files beside the photographs.
     """
 
     name: str
     find: Callable[[Path], Path | None]
     is_one: Callable[[Path], bool]
-    read: Callable[[Path], DataSet]
+    read: Callable[[Path, Path | None], DataSet]
+    is_folder: bool = False
 
 
 SURVEY_FORMATS = (
-    SurveyFormat(EXPECTED_RECONSTRUCTION, find_reconstruction, is_reconstruction, read_reconstruction),
-    SurveyFormat(EXPECTED_METASHAPE, find_metashape, is_metashape, read_metashape),
+    SurveyFormat(
+        EXPECTED_RECONSTRUCTION, find_reconstruction, is_reconstruction, lambda path, _: read_reconstruction(path)
+    ),
+    SurveyFormat(EXPECTED_METASHAPE, find_metashape, is_metashape, lambda path, _: read_metashape(path)),
+    SurveyFormat(XMP_FILES, find_xmp, lambda _: False, read_xmp, is_folder=True),
 )
 """Every survey format, in the order in which a folder is searched."""
 SURVEY_FILES = " or ".join(row.name for row in SURVEY_FORMATS)
@@ -58,18 +65,25 @@ SURVEY_FILES = " or ".join(row.name for row in SURVEY_FORMATS)
 class Survey(NamedTuple):
     """The cameras of a survey.
 
-    cameras: the file.
-    read: function that reads the file.
+    cameras: the file, or the folder of files beside the photographs.
+    format: the format of the cameras.
     top: folder of the scene, in which the photographs are searched.
     """
 
     cameras: Path
-    read: Callable[[Path], DataSet]
+    format: SurveyFormat
     top: Path
+
+    def read(self, photographs: Path | None = None) -> DataSet:
+        """Read and check the cameras. photographs: the folder of photographs, if the user gave one."""
+        data = self.format.read(self.cameras, photographs)
+        check_names(self.cameras, data.images)
+        check_units(self.cameras, data.images)
+        return data
 
     def images(self) -> list[PosedImage]:
         """Read the images, sorted by name. Photographs need not exist, unless their sizes are not in the file."""
-        return sorted(self.read(self.cameras).images, key=lambda image: image.name)
+        return sorted(self.read().images, key=lambda image: image.name)
 
 
 def survey_of(path: Path) -> Survey | None:
@@ -79,7 +93,7 @@ def survey_of(path: Path) -> Survey | None:
         if cameras is not None:
             folder = cameras.parent if is_file(cameras) else cameras
             of_project = folder.name == OPENSFM_FOLDER and not (folder / "images").is_dir()
-            return Survey(cameras, row.read, folder.parent if of_project else folder)
+            return Survey(cameras, row, folder.parent if of_project else folder)
     return None
 
 

@@ -206,7 +206,7 @@ class _Sensors:
         if shift > MAX_SKEW_SHIFT_PX:
             raise InputError(
                 f"{where}: the skew b2 = {skew:g} moves pixels by up to {shift:.2g}, expected at most "
-                f"{MAX_SKEW_SHIFT_PX:g}, as no lens model here has it; {UNDISTORTED_ADVICE}, or calibrate without b2"
+                f"{MAX_SKEW_SHIFT_PX:g}, as no lens model here has a skew; {UNDISTORTED_ADVICE}, or do not fit b2"
             )
         if shift:
             self._skews.append(f"{shift:.2g} pixels ({where.rpartition(': ')[2]})")
