@@ -20,7 +20,7 @@ from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.orientation import AS_IN_FILES
 from clsplat.errors import InputError, warn
-from clsplat.files.atomic import check_new
+from clsplat.files.atomic import check_new, remove
 from clsplat.files.documents import is_file, read_document
 from clsplat.progress import StageProgress
 from clsplat.selftest.result import FORWARD_STAGES
@@ -158,6 +158,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
     from clsplat.runs.run import model_file
+    from clsplat.scenes.geography.georeference import beside_model, read_of_model, write_georeference
 
     source, merged = model_file(verb.source), [model_file(path) for path in verb.merge]
     _check(verb)
@@ -167,12 +168,19 @@ def run(verb: ConvertVerb, services: Services) -> int:
     for companion in target_format.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
     options = _of_format(verb, target_format)
+    place = read_of_model(source)
+    if place is not None:
+        check_new(beside_model(verb.target), overwrite=verb.overwrite)
     original, space = load(source, activated=verb.activated), colour_space(source)
     edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
     if not target_format.floats:
         edited = edit.without_empty_bands(edited)
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
+    if place is not None:
+        write_georeference(beside_model(verb.target), place if matrix is None else place.moved(matrix))
+    elif verb.overwrite:
+        remove(beside_model(verb.target))  # it belongs to the file that was replaced
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} cannot store the colour space, {space}; readers will assume sRGB")
     read = load(verb.target, check_encoding=False)  # reading the source has already warned of odd encodings

@@ -40,6 +40,7 @@ from clsplat.runs.settings import (
     config_text,
     read_config,
 )
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, Georeference, write_georeference
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SOURCE_FRAME, SceneFrame, read_frame, write_frame
 from clsplat.scenes.readers.scene_frame import frame_of_files
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
@@ -137,6 +138,11 @@ class Run:
         """Write frame.json, unless the frame is the one that the scene's cameras had first."""
         if not frame.is_source:
             write_frame(self.path, frame)
+
+    def keep_georeference(self, georeference: Georeference | None) -> None:
+        """Write georeference.json, for the model's coordinates, if the scene's place on the earth is known."""
+        if georeference is not None:
+            write_georeference(self.path / GEOREFERENCE_FILE, georeference)
 
     def is_scene(self, path: Path) -> bool:
         """True if `path` is the run's scene, or what structure from motion made of it."""
@@ -416,7 +422,7 @@ def owned_files(path: Path) -> list[Path]:
     )
     # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.
     learnt = ("appearance.json", "appearance.npz")
-    records = ("eval.json", *learnt, "report.html", FRAME_RECORD_FILE, "scene.json")
+    records = ("eval.json", *learnt, "report.html", FRAME_RECORD_FILE, GEOREFERENCE_FILE, "scene.json")
     names = ("model.ply", "metrics.jsonl", *records, "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in files if file.is_file() or file.is_symlink()]

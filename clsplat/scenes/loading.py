@@ -31,7 +31,8 @@ from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_survey
 from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
-from clsplat.scenes.readers.scene_frame import frame_of_files
+from clsplat.scenes.readers.colmap import find_model
+from clsplat.scenes.readers.scene_frame import frame_of_files, georeference_by_gps, georeferenced
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
@@ -152,10 +153,12 @@ def _read(
 
     images, missing, masks, work_dir, progress: as for `load_scene`.
     """
-    if kind in ("blender", "transforms"):
-        return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
-    if kind == "survey":
-        return _SceneFiles(read_survey(path, images, missing), path, (), masks)
+    if kind in ("blender", "transforms", "survey"):
+        if kind == "survey":
+            data = read_survey(path, images, missing)
+        else:
+            data = read_transforms(path, kind, images, missing, masks=masks.masks != "none")
+        return _SceneFiles(georeferenced(data, path, [path if path.is_dir() else path.parent]), path, (), masks)
     folder = path
     if kind == "photos":
         photos = path.resolve()
@@ -163,6 +166,7 @@ def _read(
         folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)
+    data = georeferenced(data, folder, [find_model(folder) or folder, folder])
     return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks, frame_of_files(folder))
 
 
@@ -224,7 +228,7 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
     scene.missing = tuple(data.missing)
     scene.frame, scene.world_from_files = files.frame, files.world_from_files
-    scene.georeference = data.georeference
+    scene.georeference = data.georeference or georeference_by_gps(files.frame)
     if files.world_from_files is not None:
         scale, _, shift = decompose(files.world_from_files)
         scene.bounds = shift - scale * cube, shift + scale * cube

@@ -198,7 +198,7 @@ class Scene:
     unit: the length unit in world units (`scenes.depth_sources`); None for the extent.
     frame: the frame of the scene, relative to the frame that its cameras had first.
     world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
-    georeference: where the scene's source frame lies on the earth; None if it is unknown.
+    georeference: where the scene lies on the earth; None if it is unknown.
     """
 
     name: str

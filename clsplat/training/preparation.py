@@ -99,6 +99,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
             scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
         scene_record.keep(run, scene, resuming=resume)
         run.keep_frame(scene.frame)
+        run.keep_georeference(scene.georeference)
         if resume and run.checkpoints():
             return scene
     for text in sanity_checks.of_scene(scene, config.background):

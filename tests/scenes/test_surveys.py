@@ -258,7 +258,12 @@ def test_a_chunk_on_the_earth_is_brought_to_a_tangent_plane(tmp_path: Path) -> N
     there = [(r @ turn.T @ plane.transform.T, ring.centre_of((r, t))) for r, t in ring.poses()]
     posed = [(rotation, -rotation @ (plane.origin + plane.transform @ (turn @ centre))) for rotation, centre in there]
     wgs84 = 'GEOGCS["WGS 84",DATUM["World Geodetic System 1984"],AUTHORITY["EPSG","4326"]]'
-    path = survey_files.write_metashape(tmp_path, posed, world_from_chunk=plane.crs_from_source, reference=wgs84)
+    path = survey_files.write_metashape(
+        tmp_path,
+        posed,
+        world_from_chunk=np.vstack([np.c_[plane.transform, plane.origin], [0, 0, 0, 1]]),
+        reference=wgs84,
+    )
     # A reference 0.00001 degrees too far north is 1.11 m off.
     latitude, longitude, altitude = place_of(-posed[3][0].T @ posed[3][1])
     at = f'<reference x="{longitude!r}" y="{latitude + 1e-5!r}" z="{altitude!r}" enabled="true"/></camera>'

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """georeference.json, the record of where a scene lies on the earth: a coordinate reference system and a similarity.
 
-The file lies beside the cameras of a scene, where users may write it, and in the folder of a run (docs/conventions.md).
+The file applies to the coordinates of the files that it lies beside: the cameras of a scene, where users may write it,
+or the model of a run. Beside a model file NAME.splat or the like it is NAME.georeference.json.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +58,11 @@ class GpsResiduals:
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Position of a scene on the earth: crs = origin + transform @ p, for points p in the scene's source frame.
-
-    The source frame is the one that the cameras had first (`SceneFrame`).
+    """Position of a scene or model on the earth: crs = origin + transform @ p, for points p of the scene or model.
 
     epsg: code of the coordinate reference system, whose coordinates are in metres. 4978 is geocentric.
-    origin: (3,), coordinates of the source frame's origin in the reference system.
-    transform: (3, 3), rotation times scale from the source frame to the reference system.
+    origin: (3,), coordinates of the world's origin in the reference system.
+    transform: (3, 3), rotation times scale from the world to the reference system.
     residuals: distances of the cameras from GPS positions; None if these are unknown.
     note: what the georeference comes from, for the user.
     """
@@ -74,12 +73,11 @@ class Georeference:
     residuals: GpsResiduals | None = None
     note: str = ""
 
-    @property
-    def crs_from_source(self) -> Float64:
-        """The similarity as a matrix (4, 4)."""
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.transform, self.origin
-        return matrix
+    def moved(self, change: Float64) -> Georeference:
+        """Return the georeference of the scene or model after a change by a similarity (4, 4)."""
+        back = np.linalg.inv(change)
+        transform = self.transform @ back[:3, :3]
+        return replace(self, origin=self.origin + self.transform @ back[:3, 3], transform=transform)
 
     def document(self) -> dict[str, Any]:
         """Return the content of georeference.json."""
@@ -123,19 +121,32 @@ def place_of(geocentric: Float64) -> tuple[float, float, float]:
     return latitude, longitude, altitude
 
 
-def write_georeference(folder: Path, georeference: Georeference) -> None:
-    """Write georeference.json into a folder."""
+def write_georeference(path: Path, georeference: Georeference) -> None:
+    """Write a record to the file `path`."""
     text = json.dumps(georeference.document(), indent=2) + "\n"
-    atomic_write(folder / GEOREFERENCE_FILE, text.encode())
+    atomic_write(path, text.encode())
 
 
-def read_georeference(folder: Path) -> Georeference | None:
-    """Read georeference.json of a folder; None if there is no such file.
+def beside_model(path: Path) -> Path:
+    """Return the path of the record of a model file."""
+    return path.with_name(f"{path.stem}.{GEOREFERENCE_FILE}")
+
+
+def read_of_model(path: Path) -> Georeference | None:
+    """Read the record of a model file: the file's own, or for model.ply the folder's; None if there is none.
+
+    Raises InputError for a damaged file.
+    """
+    own = read_georeference(beside_model(path))
+    return own if own is not None or path.name != "model.ply" else read_georeference(path.parent / GEOREFERENCE_FILE)
+
+
+def read_georeference(path: Path) -> Georeference | None:
+    """Read the record in the file `path`; None if there is no such file.
 
     Only `epsg` is required. Without `origin` and `transform` the scene's coordinates are those of the reference system.
     Raises InputError for a damaged file, and for a reference system in degrees.
     """
-    path = folder / GEOREFERENCE_FILE
     if not is_file(path):
         return None
     try:
@@ -150,9 +161,7 @@ def read_georeference(folder: Path) -> Georeference | None:
         raise InputError(f"{path}: 'origin' is {str(origin)[:60]}, expected three numbers")
     axes = np.eye(3) if transform is None else numbers(transform)
     if not _is_similarity(axes):
-        raise InputError(
-            f"{path}: 'transform' is {str(transform)[:60]}, expected 3 x 3 numbers: a rotation times a scale"
-        )
+        raise InputError(f"{path}: 'transform' is {str(transform)[:60]}, expected a rotation times a scale (3 x 3)")
     note = document.get("note")
     residuals = _residuals(document.get("gps_residuals"))
     return Georeference(
@@ -162,9 +171,8 @@ def read_georeference(folder: Path) -> Georeference | None:
 
 def _epsg(path: Path, code: Any) -> int:
     if isinstance(code, bool) or not isinstance(code, int) or not 0 < code < MAX_EPSG_CODE:
-        raise InputError(
-            f"{path}: 'epsg' is {str(code)[:60]}, expected the whole number of an EPSG code, such as 32632"
-        )
+        found = "has no 'epsg'" if code is None else f"'epsg' is {str(code)[:60]}"
+        raise InputError(f"{path}: {found}, expected the number of an EPSG code, such as 32632")
     if code in GEOGRAPHIC_EPSG_CODES and code not in GEOCENTRIC_EPSG_CODES:
         raise InputError(
             f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "

@@ -11,6 +11,7 @@ from clsplat.config.orientation import FrameUse, Orient
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import move_into_place
 from clsplat.files.documents import is_file
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, read_georeference, write_georeference
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, SceneFrame, read_frame, write_frame
 from clsplat.scenes.orientation.new_frame import new_frame
 from clsplat.scenes.readers.colmap import read_model
@@ -82,6 +83,8 @@ def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneF
         shutil.copytree(folder, made, ignore=shutil.ignore_patterns(FRAME_RECORD_FILE))
         model.write(made)
         write_frame(made, frame)
+        if (place := read_georeference(folder / GEOREFERENCE_FILE)) is not None:
+            write_georeference(made / GEOREFERENCE_FILE, place.moved(change))
         move_into_place(work, folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)

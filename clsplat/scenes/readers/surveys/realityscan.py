@@ -157,8 +157,8 @@ class _Xmp:
             raise unsupported(where, f"xcr:DistortionModel {short(model)}", ", ".join(RADIAL_TERMS))
         if skew := float(self.numbers("Skew", 1, 0.0)[0]):
             raise InputError(
-                f"{where}: xcr:Skew is {skew:g}, expected 0, as no lens model here has a skew; {UNDISTORTED_ADVICE}, or "
-                "align without skew"
+                f"{where}: xcr:Skew is {skew:g}, expected 0, as no lens model here has a skew; {UNDISTORTED_ADVICE}, "
+                "or align without skew"
             )
         longer = max(width, height)
         focal = longer * float(self.numbers("FocalLength35mm", 1)[0]) / FRAME_WIDTH_MM
