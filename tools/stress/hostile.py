@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
 from hostile_photographs import CAMERA_WRITERS, HAS_CAMERA_DECODERS, make_camera_image
-from hostile_surveys import GEOREFERENCE_FILE, SURVEYS, XMP_NAMES, make_georeference, make_xmp, read_place
+from hostile_surveys import SURVEYS, XMP_NAMES, make_georeference, make_xmp, read_place
 from hostile_videos import make_frames, make_video, read_frames, read_video
 from ksplats import ksplat
 from models import random_gaussians
@@ -423,7 +423,7 @@ _ALL = (
     Reader("blender", make_blender, read_scene, ("transforms_train.json", "transforms_test.json"), DOCUMENT, 2),
     *(Reader(name, make, partial(read_scene, file=file), (file,), DOCUMENT, 3) for name, make, file in SURVEYS),
     Reader("xmp", make_xmp, read_scene, XMP_NAMES, TEXT, 3),
-    Reader("georeference", make_georeference, read_place, (GEOREFERENCE_FILE,), DOCUMENT),
+    Reader("georeference", make_georeference, read_place, ("georeference.json",), DOCUMENT),
     *(
         Reader(f"cameras-{kind}", make, partial(read_cameras, name=name), (name,), DOCUMENT, 3)
         for kind, make, name in (
