@@ -148,6 +148,32 @@ def test_the_place_of_a_reconstruction_is_its_georeference(tmp_path: Path) -> No
     np.testing.assert_array_equal(beside.origin, found.origin)
 
 
+def test_gps_positions_that_are_far_off_are_named(tmp_path: Path) -> None:
+    path = survey_files.write_opensfm(tmp_path, reference_lla={"latitude": 48.0, "longitude": 11.0, "altitude": 500.0})
+    (part,) = json.loads(path.read_text())
+    for index, pose in enumerate(ring.poses()):
+        off = [1000.0, 0, 0] if index in (3, 7, 9) else [0, 2.0, 0]
+        part["shots"][ring.NAMES[index]]["gps_position"] = np.add(ring.centre_of(pose), off).tolist()
+    path.write_text(json.dumps([part]))
+    told = (
+        "GPS of 3 photograph.s. is far .* not used: view03.png by 1,000 m, view07.png by 1,000 m, view09.png by 1,000 m"
+    )
+    found = warned(told, read_reconstruction, path).georeference
+    assert found is not None
+    assert found.residuals is not None
+    assert (found.residuals.count, found.residuals.largest) == (17, pytest.approx(2.0))
+
+
+def test_a_reference_that_is_not_of_these_cameras_is_not_used(tmp_path: Path) -> None:
+    """As in ODM's reconstruction.geocoords.json: cameras in UTM, and still reference_lla."""
+    place = {"latitude": 48.0, "longitude": 11.0, "altitude": 500.0}
+    path = survey_files.write_opensfm(tmp_path, survey_files.at(), reference_lla=place)
+    data = warned(
+        "its cameras are 5,4.. km from its reference_lla, expected less than 100 km", read_reconstruction, path
+    )
+    assert data.georeference is None
+
+
 def change_shot(part: dict[str, Any], **keys: Any) -> None:
     part["shots"][ring.NAMES[1]].update(keys)
 

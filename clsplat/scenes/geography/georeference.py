@@ -8,6 +8,7 @@ or the model of a run. Beside a model file NAME.splat or the like it is NAME.geo
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float64, numbers
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import is_file, parse_json, read_document
 
@@ -33,6 +34,9 @@ MAX_EPSG_CODE = 1_000_000
 """Limit of EPSG codes."""
 SIMILARITY_SLACK = 1e-6
 """Largest relative deviation of a transform from a rotation times a scale. Numbers with 7 digits deviate by less."""
+DOUBTED_MEDIANS, MIN_DOUBTED_METRES = 6.0, 30.0
+"""GPS positions are not used if they are farther from their cameras than the first number times the median distance,
+and than the second number of metres."""
 _EXPECTED_GEOREFERENCE = "the record of where a scene lies on the earth"
 
 
@@ -40,7 +44,7 @@ _EXPECTED_GEOREFERENCE = "the record of where a scene lies on the earth"
 class GpsResiduals:
     """Distances in metres between the cameras and the GPS positions of their photographs.
 
-    count: number of photographs with a GPS position.
+    count: number of photographs whose GPS position is used.
     rms, largest: root mean square and maximum of the distances.
     """
 
@@ -49,11 +53,18 @@ class GpsResiduals:
     largest: float
 
     @classmethod
-    def of(cls, distances: Float64) -> GpsResiduals | None:
-        """Summarise distances (N,); None for none."""
-        if not len(distances):
+    def of(cls, where: object, distances: Mapping[str, float]) -> GpsResiduals | None:
+        """Summarise distances in metres by the photographs' names, without positions that are far off; None for none.
+
+        where: the file, for the warning that names photographs whose position is far off.
+        """
+        if not distances:
             return None
-        return cls(len(distances), float(np.sqrt(np.mean(distances**2))), float(distances.max()))
+        limit = max(DOUBTED_MEDIANS * float(np.median([*distances.values()])), MIN_DOUBTED_METRES)
+        if far := [f"{name} by {metres:,.0f} m" for name, metres in distances.items() if metres > limit]:
+            warn(f"{where}: GPS of {len(far):,} photograph(s) is far from the cameras and not used: {examples(far)}")
+        near = np.array([metres for metres in distances.values() if metres <= limit])
+        return cls(len(near), float(np.sqrt(np.mean(near**2))), float(near.max()))
 
 
 @dataclass(frozen=True, eq=False)

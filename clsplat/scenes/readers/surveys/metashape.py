@@ -325,13 +325,13 @@ def _on_earth(
     codes = re.findall(r'"EPSG"\s*,\s*"?(\d{1,9})"?', system)
     named = f" in EPSG:{codes[-1]}" if codes else ""
     note = f"the chunk{named} of Metashape's cameras: x east, y north, z up, metres"
-    distances = []
+    distances = {}
     if system.upper().startswith(("GEOGCS", "GEOGCRS", "GEODCRS")):
-        for camera, centre in zip(cameras, centres, strict=True):
+        for camera, image, centre in zip(cameras, images, centres, strict=True):
             at = camera.reference()
             if at is not None and abs(at[1]) <= 90 and abs(at[0]) <= 360:
-                distances.append(float(np.linalg.norm(geocentric_of((at[1], at[0], at[2])) - centre)))
-    found = on_tangent_plane(place, note, GpsResiduals.of(np.array(distances)))
+                distances[image.name] = float(np.linalg.norm(geocentric_of((at[1], at[0], at[2])) - centre))
+    found = on_tangent_plane(place, note, GpsResiduals.of(cameras[0].path, distances))
     moved = []
     for image, centre in zip(images, centres, strict=True):
         rotation = image.rotation @ found.transform

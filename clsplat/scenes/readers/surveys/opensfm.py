@@ -35,6 +35,8 @@ RECONSTRUCTION_HEAD_BYTES = 4096
 """Number of bytes at the beginning of a file by which a reconstruction.json with another name is recognised."""
 NO_GPS_DOP = 1e5
 """`gps_dop` from which on a photograph counts as without GPS. OpenSfM writes 999999 for such photographs."""
+MAX_PLANE_METRES = 1e5
+"""Largest distance of the cameras from the place of the world's origin. The earth falls by 800 m over this distance."""
 ONE_FOCAL_KINDS = ("perspective", "fisheye")
 """Values of `projection_type` with one focal length, and the principal point in the middle."""
 TWO_FOCAL_KINDS = ("brown", "radial", "simple_radial", "fisheye_opencv")
@@ -172,10 +174,17 @@ def _georeference(
     latitude, longitude, altitude = (keys.require(key) for key in ("latitude", "longitude", "altitude"))
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise keys.wrong("latitude" if abs(latitude) > 90 else "longitude", "degrees on the earth")
-    distances = []
-    for shot, image in zip(shots.values(), images, strict=True):
+    centres = {image.name: -image.rotation.T @ image.translation for image in images}
+    away = float(np.linalg.norm(np.median([*centres.values()], axis=0)))
+    if away > MAX_PLANE_METRES:
+        warn(
+            f"{path}: its cameras are {away / 1000:,.0f} km from its reference_lla, expected less than "
+            f"{MAX_PLANE_METRES / 1000:g} km; they are in another coordinate system, and reference_lla is not used"
+        )
+        return None
+    distances = {}
+    for shot, (name, centre) in zip(shots.values(), centres.items(), strict=True):
         if shot.get("gps_position") is not None and (shot.number("gps_dop") or 0.0) < NO_GPS_DOP:
-            centre = -image.rotation.T @ image.translation
-            distances.append(float(np.linalg.norm(shot.vector("gps_position", 3) - centre)))
+            distances[name] = float(np.linalg.norm(shot.vector("gps_position", 3) - centre))
     note = "reference_lla of reconstruction.json: x east, y north, z up"
-    return on_tangent_plane((latitude, longitude, altitude), note, GpsResiduals.of(np.array(distances)))
+    return on_tangent_plane((latitude, longitude, altitude), note, GpsResiduals.of(path, distances))
