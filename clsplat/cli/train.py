@@ -43,8 +43,8 @@ class TrainVerb(Verb):
     """Folder for the run: config.toml, scene.json, model.ply, metrics.jsonl, eval.json, report.html, checkpoints/,
     test/."""
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
-    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos, videos or both; or a video. Not
-    needed with --resume."""
+    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, a survey of OpenSfM, WebODM, Metashape or
+    RealityScan, or just photos, videos or both; or a video. Not needed with --resume."""
     resume: Flag = False
     """Continue the run in the output folder."""
     accept_changes: Flag = False
