@@ -132,7 +132,9 @@ def _add_pictures(data: DataSet, folder: Path, listed_in: Path, missing: Missing
     if not present:
         raise InputError(f"{folder}: no images found, expected the {len(data.images)} images of {listed_in}")
     listed = [image.name for image in data.images]
-    labelled = {path.relative_to(folder).with_suffix("").as_posix(): path for path in present} if labels else {}
+    # Of two files such as IMG.jpg and IMG.png, which is a mask, the first one in alphabetical order counts.
+    by_label = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(present)}
+    labelled = by_label if labels else {}
     exact = [labelled.get(name, folder / name) for name in listed]
     files = find_pictures(listed, exact, folder, listed_in, missing, present)
     names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]

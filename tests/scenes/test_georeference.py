@@ -34,6 +34,7 @@ from clsplat.scenes.geography.georeference import (
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import SceneFrame
 from clsplat.scenes.readers.scene_frame import georeference_by_gps
+from clsplat.scenes.sfm.framing import MODEL_FOLDER, set_frame
 
 
 def on_earth(place: Georeference, points: Any) -> Any:
@@ -116,6 +117,21 @@ def test_a_record_beside_the_cameras_is_the_scenes(tmp_path: Path, beside: str) 
             np.testing.assert_allclose(
                 on_earth(scene.georeference, view.camera.position), ring.centre_of(pose), rtol=0, atol=1e-6
             )
+
+
+def test_sfm_moves_it_with_the_cameras(tmp_path: Path) -> None:
+    folder = ring.write_colmap(tmp_path / "scene", posed=survey_files.at())
+    points = folder / MODEL_FOLDER / "points3D.txt"
+    points.write_text(points.read_text().replace(" 0.5 1 0 2 0\n", " 0.5\n"))  # no image has observations
+    (folder / MODEL_FOLDER / GEOREFERENCE_FILE).write_text('{"epsg": 32632}')
+    for name in ("up", "none"):
+        set_frame(folder, folder / "images", FrameUse(name), "scene")  # type: ignore[arg-type]
+        scene = load_scene(folder)
+        assert scene.georeference is not None
+        places = [on_earth(scene.georeference, view.camera.position) for view in scene.views]
+        wanted = [ring.centre_of(pose) for pose in survey_files.at()]
+        np.testing.assert_allclose(places, wanted, rtol=0, atol=1e-6)
+    assert np.abs(scene.georeference.transform - np.eye(3)).max() < 1e-9
 
 
 def test_two_coordinate_systems_are_refused(tmp_path: Path) -> None:

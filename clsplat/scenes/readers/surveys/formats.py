@@ -24,8 +24,8 @@ from clsplat.scenes.readers.surveys.opensfm import (
 )
 from clsplat.scenes.readers.surveys.realityscan import XMP_FILES, find_xmp, read_xmp
 
-MAX_SPREAD_DEGREES = 0.5
-"""Largest extent, along x and y, of positions that may be degrees of longitude and latitude."""
+MIN_SPREAD_DEGREES, MAX_SPREAD_DEGREES = 1e-5, 0.5
+"""Least and largest extent, along x and y, of positions that may be degrees of longitude and latitude."""
 MIN_HEIGHT_PER_DEGREE = 300.0
 """Smallest ratio of the extents along z and in x and y of positions that count as metres over degrees. For a flight
 with a kilometre to each metre of height it is 111."""
@@ -113,10 +113,12 @@ def check_units(path: Path, images: Sequence[PosedImage]) -> None:
     path: the file of cameras, for the message.
     """
     centres = np.stack([-image.rotation.T @ image.translation for image in images])
-    extent = np.ptp(centres, axis=0)
+    extent, middle = np.ptp(centres, axis=0), np.abs(np.median(centres, axis=0))
     across = float(extent[:2].max())
     on_globe = bool((np.abs(centres[:, 0]) <= 360).all() and (np.abs(centres[:, 1]) <= 90).all())
-    if on_globe and 0 < across < MAX_SPREAD_DEGREES and extent[2] > MIN_HEIGHT_PER_DEGREE * across:
+    is_off_origin = max(middle[:2]) > MAX_SPREAD_DEGREES  # local coordinates have their origin near the cameras
+    is_wide = MIN_SPREAD_DEGREES < across < MAX_SPREAD_DEGREES
+    if on_globe and is_off_origin and is_wide and extent[2] > MIN_HEIGHT_PER_DEGREE * across:
         x, y, z = centres[0].tolist()
         raise InputError(
             f"{path}: the positions look like degrees with heights in metres (the first is {x:.6g} {y:.6g} {z:.6g}), "

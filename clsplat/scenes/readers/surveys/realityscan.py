@@ -48,7 +48,7 @@ XMP_PATTERN = "*.[xX][mM][pP]"
 
 
 def find_xmp(folder: Path) -> Path | None:
-    """Return the folder if it or its sub-folders have an XMP file with a camera's position; None otherwise."""
+    """Return the folder if it or its sub-folders have an XMP file with a camera's pose; None otherwise."""
     return folder if any(_has_pose(path) for path in _sidecars(folder)) else None
 
 
@@ -56,7 +56,7 @@ def read_xmp(folder: Path, photographs: Path | None) -> DataSet:
     """Read the XMP files of a folder. The images have no paths, and there are no points.
 
     photographs: folder with the photographs, which have the same names; None if they are beside the XMP files.
-    XMP files without a position are left out: RealityScan has not aligned their photographs. Raises InputError that
+    XMP files without a pose are left out: RealityScan has not aligned their photographs. Raises InputError that
     names the file for invalid XML and values, files of different coordinate systems, unsupported lenses, and XMP files
     of which no photograph is found.
     """
@@ -65,7 +65,8 @@ def read_xmp(folder: Path, photographs: Path | None) -> DataSet:
     there = photographs or folder
     present = find_images(there)
     files = {path.relative_to(there).as_posix(): path for path in present}  # IMG.jpg.xmp, then IMG.xmp
-    files |= {path.relative_to(there).with_suffix("").as_posix(): path for path in present}
+    # Of two files such as IMG.jpg and IMG.png, which is a mask, the first one in alphabetical order counts.
+    files |= {path.relative_to(there).with_suffix("").as_posix(): path for path in reversed(present)}
     sizes = {camera.name: image_size(files[camera.name], orient=False) for camera in cameras if camera.name in files}
     if not sizes:
         names = examples(camera.name for camera in cameras)
@@ -88,7 +89,7 @@ def _has_pose(path: Path) -> bool:
         return False
     with open_input(path, EXPECTED_XMP) as file:
         data = file.read(MAX_XMP_BYTES)
-    return XCR_BYTES in data and b"Position" in data
+    return XCR_BYTES in data and b"Position" in data and b"Rotation" in data
 
 
 @dataclass(frozen=True)
