@@ -100,6 +100,12 @@ def test_the_place_of_a_reconstruction_is_its_georeference(tmp_path: Path) -> No
     np.testing.assert_array_equal(beside.origin, found.origin)
 
 
+def test_a_place_of_zeros_is_unknown(tmp_path: Path) -> None:
+    """As OpenSfM writes it for photographs without GPS."""
+    nowhere = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+    assert read_reconstruction(survey_files.write_opensfm(tmp_path, reference_lla=nowhere)).georeference is None
+
+
 def test_gps_positions_that_are_far_off_are_named(tmp_path: Path) -> None:
     path = survey_files.write_opensfm(tmp_path, reference_lla={"latitude": 48.0, "longitude": 11.0, "altitude": 500.0})
     (part,) = json.loads(path.read_text())

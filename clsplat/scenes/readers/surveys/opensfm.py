@@ -172,6 +172,8 @@ def _georeference(
         raise InputError(f"{where}: 'reference_lla' is {short(place)}, expected latitude, longitude and altitude")
     keys = Keys(where, "reference_lla", place, {})
     latitude, longitude, altitude = (keys.require(key) for key in ("latitude", "longitude", "altitude"))
+    if latitude == longitude == altitude == 0:  # OpenSfM's value for photographs without GPS
+        return None
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise keys.wrong("latitude" if abs(latitude) > 90 else "longitude", "degrees on the earth")
     centres = {image.name: -image.rotation.T @ image.translation for image in images}
