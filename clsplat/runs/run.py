@@ -139,11 +139,6 @@ class Run:
         if not frame.is_source:
             write_frame(self.path, frame)
 
-    def keep_georeference(self, georeference: Georeference | None) -> None:
-        """Write georeference.json, for the model's coordinates, if the scene's place on the earth is known."""
-        if georeference is not None:
-            write_georeference(self.path / GEOREFERENCE_FILE, georeference)
-
     def is_scene(self, path: Path) -> bool:
         """True if `path` is the run's scene, or what structure from motion made of it."""
         if self.scene is None:
@@ -183,6 +178,11 @@ class Run:
         if config != self.config:
             atomic_write(self.config_path, config_text(config, self.scene).encode())
             self.config = config
+
+    def keep_georeference(self, georeference: Georeference | None) -> None:
+        """Write georeference.json, for the model's coordinates, if the scene's place on the earth is known."""
+        if georeference is not None:
+            write_georeference(self.path / GEOREFERENCE_FILE, georeference)
 
     def save_model(self, gaussians: Gaussians, space: str = "sRGB") -> None:
         """Write model.ply.

@@ -32,7 +32,8 @@ from clsplat.scenes.orientation.frame_record import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
 from clsplat.scenes.readers.colmap import find_model
-from clsplat.scenes.readers.scene_frame import frame_of_files, georeference_by_gps, georeferenced
+from clsplat.scenes.readers.scene_frame import frame_of_files
+from clsplat.scenes.readers.scene_place import georeference_by_gps, georeferenced
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
 from clsplat.scenes.sfm.video_frames import reconstruction_folder

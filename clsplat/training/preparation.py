@@ -97,9 +97,9 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
         run.keep_config(config)
         if resume:
             scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
+        run.keep_georeference(scene.georeference)
         scene_record.keep(run, scene, resuming=resume)
         run.keep_frame(scene.frame)
-        run.keep_georeference(scene.georeference)
         if resume and run.checkpoints():
             return scene
     for text in sanity_checks.of_scene(scene, config.background):

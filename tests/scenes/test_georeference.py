@@ -33,7 +33,7 @@ from clsplat.scenes.geography.georeference import (
 )
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import SceneFrame
-from clsplat.scenes.readers.scene_frame import georeference_by_gps
+from clsplat.scenes.readers.scene_place import georeference_by_gps
 from clsplat.scenes.sfm.framing import MODEL_FOLDER, set_frame
 
 
