@@ -21,7 +21,7 @@ from clsplat.config.masks import NO_MASKS
 from clsplat.config.orientation import AS_IN_FILES
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
-from clsplat.files.atomic import check_new
+from clsplat.files.atomic import atomic_write, check_new, remove
 from clsplat.files.documents import is_file, read_document
 from clsplat.progress import StageProgress
 from clsplat.selftest.result import FORWARD_STAGES
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from clsplat.camera import Camera
     from clsplat.gaussians import Gaussians
     from clsplat.models.formats import Format
+    from clsplat.scenes.geography.georeference import Georeference
 
     NamedModel = tuple[Path, Gaussians]
 
@@ -168,12 +169,14 @@ def run(verb: ConvertVerb, services: Services) -> int:
     for companion in target_format.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
     options = _of_format(verb, target_format)
+    place = _place_of(verb, source)
     original, space = load(source, activated=verb.activated), colour_space(source)
     edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
     if not target_format.floats:
         edited = edit.without_empty_bands(edited)
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
+    _keep_place(verb, place, matrix)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} cannot store the colour space, {space}; readers will assume sRGB")
     read = load(verb.target, check_encoding=False)  # reading the source has already warned of odd encodings
@@ -209,6 +212,32 @@ def run(verb: ConvertVerb, services: Services) -> int:
         mean, least = scene["between"], scene["least_between"]
         print(f"PSNR between the two renders of a view: {mean:.2f} dB on average, {least:.2f} dB at the lowest")
     return 0
+
+
+def _place_of(verb: ConvertVerb, source: Path) -> Georeference | None:
+    """Return the place on the earth of the model file `source`; None if it is unknown.
+
+    Raises InputError if the target's record of its place may not be written.
+    """
+    from clsplat.scenes.geography.georeference import beside_model, read_of_model
+
+    place = read_of_model(source)
+    if place is not None:
+        check_new(beside_model(verb.target), overwrite=verb.overwrite)
+    return place
+
+
+def _keep_place(verb: ConvertVerb, place: Georeference | None, matrix: Float64 | None) -> None:
+    """Write the target's place on the earth. The place of a file that was replaced is removed.
+
+    place: the source's place. matrix: (4, 4), the transform of the edits; None if they do not transform the model.
+    """
+    from clsplat.scenes.geography.georeference import beside_model
+
+    if place is not None:
+        atomic_write(beside_model(verb.target), (place if matrix is None else place.moved(matrix)).content())
+    elif verb.overwrite:
+        remove(beside_model(verb.target))
 
 
 def _check(verb: ConvertVerb) -> None:

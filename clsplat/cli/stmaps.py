@@ -24,7 +24,7 @@ class StmapsVerb(Verb):
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of a COLMAP model or of a scene that contains one, or a transforms.json."""
+    """Folder of a COLMAP model or of a scene that contains one, a transforms.json, or cameras of a survey."""
     output: Annotated[Path, arg(aliases=("-o",), metavar="FOLDER")]
     """Folder for the maps, created if missing. Each lens has a pair: lens-1.distort.exr, lens-1.undistort.exr and so
     on."""
@@ -41,7 +41,9 @@ def run(verb: StmapsVerb, _: Services) -> int:
     from clsplat.shots.read import photographed
 
     if not verb.scene.exists():
-        raise InputError(f"{verb.scene}: no such folder or file, expected a COLMAP model or a transforms.json")
+        raise InputError(
+            f"{verb.scene}: no such folder or file, expected a COLMAP model, a transforms.json or cameras of a survey"
+        )
     pictures: dict[Any, list[str]] = {}
     for image in photographed(verb.scene):
         if not image.lens.is_pinhole:

@@ -43,8 +43,8 @@ class TrainVerb(Verb):
     """Folder for the run: config.toml, scene.json, model.ply, metrics.jsonl, eval.json, report.html, checkpoints/,
     test/."""
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
-    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos, videos or both; or a video. Not
-    needed with --resume."""
+    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, a survey of OpenSfM, WebODM, Metashape or
+    RealityScan, or just photos, videos or both; or a video. Not needed with --resume."""
     frames: OptionalInt = None
     """Number of frames to take from each video, as with clsplat sfm --frames. If not given: frames that were taken
     before, of any number, else a number by length and motion."""

@@ -120,7 +120,7 @@ class WarpConfig:
     from its lower left corner. Rendering extends as far as the map reaches. '' warps nothing."""
     distort: bool = False
     """Distort pictures like the photographs' lenses, so that they match the original photographs. For cameras of a
-    COLMAP model or a transforms.json."""
+    COLMAP model, of a transforms.json or of a survey."""
 
     def check(self, channels: Collection[str] = ()) -> None:
         """Raise InputError if both settings are given, or if distortion makes a channel undefined.

@@ -40,6 +40,7 @@ from clsplat.runs.settings import (
     read_config,
 )
 from clsplat.scenes.dataset import SOURCE_FRAME, SceneFrame
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
 
@@ -400,7 +401,7 @@ def owned_files(path: Path) -> list[Path]:
     )
     # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.
     learnt = ("appearance.json", "appearance.npz")
-    records = ("eval.json", *learnt, "report.html", FRAME_RECORD_FILE, "scene.json")
+    records = ("eval.json", *learnt, "report.html", FRAME_RECORD_FILE, GEOREFERENCE_FILE, "scene.json")
     names = ("model.ply", "metrics.jsonl", *records, "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in files if file.is_file() or file.is_symlink()]

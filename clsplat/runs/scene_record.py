@@ -18,6 +18,7 @@ from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import parse_json, read_document, short_digest
 from clsplat.runs.checkpoints import scene_of
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.version import package_version
 
@@ -204,7 +205,8 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
     """Write scene.json, unless the run is resumed and its scene.json was made at the same --resolution. Warns if a
     resumed run has no scene.json.
 
-    Also writes frame.json, unless the scene has the frame that its cameras had first.
+    Also writes frame.json, unless the scene has the frame that its cameras had first, and georeference.json if the
+    scene's place on the earth is known.
     """
     known = read(run) if resuming else None
     if known is None and resuming and run.checkpoints():
@@ -216,6 +218,8 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
         write(run, scene)
     if not scene.frame.is_source:
         atomic_write(run.path / FRAME_RECORD_FILE, scene.frame.content())
+    if scene.georeference is not None:
+        atomic_write(run.path / GEOREFERENCE_FILE, scene.georeference.content())
 
 
 def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:

@@ -26,6 +26,7 @@ from clsplat.errors import InputError, examples
 from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
+from clsplat.scenes.geography.georeference import Georeference
 
 # If Ctrl-C interrupts its import, pycolmap says that it is not installed. It also sets a SIGTERM handler that prints a
 # stack trace. `undisturbed` prevents both.
@@ -317,6 +318,7 @@ class DataSet:
     missing: names of listed pictures that do not exist and are left out.
     clouds: point files that the data set does not name. The first one is used if `points` is empty.
     frame: the frame of the images and points.
+    georeference: where the data set lies on the earth; None if its files do not say it.
     """
 
     images: list[PosedImage]
@@ -326,6 +328,7 @@ class DataSet:
     missing: list[str] = field(default_factory=list)
     clouds: list[Path] = field(default_factory=list)
     frame: SceneFrame = SOURCE_FRAME
+    georeference: Georeference | None = None
 
 
 def check_lens(lens: Lens, where: str) -> Lens:

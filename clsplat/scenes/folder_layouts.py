@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detection of a data set's layout (COLMAP, Blender, nerfstudio, photos), and reading of its images and their split."""
+"""Detection of a data set's layout (COLMAP, Blender, nerfstudio, surveys, photos), and reading of its images and their
+split."""
 
 from __future__ import annotations
 
@@ -18,11 +19,12 @@ from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_p
 from clsplat.scenes.photo_names import legible, match
 from clsplat.scenes.point_files import clouds_beside
 from clsplat.scenes.readers import colmap, transforms
+from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, survey_of
 from clsplat.scenes.sfm.video_frames import find_videos
 from clsplat.scenes.sidecar_files import inside
 from clsplat.scenes.video.reading import is_video_name
 
-Kind = Literal["colmap", "blender", "transforms", "photos"]
+Kind = Literal["colmap", "blender", "transforms", "survey", "photos"]
 
 COLMAP_IMAGE_FOLDER = "images"
 """Name of the picture folder of a COLMAP model."""
@@ -40,7 +42,7 @@ MAX_HELD_OUT_LIST_BYTES = 64 << 20
 
 
 def detect(path: Path) -> Kind:
-    """Return the layout of a scene's folder, transforms.json or video. Raises InputError if no layout fits.
+    """Return the layout of a scene's folder, camera file or video. Raises InputError if no layout fits.
 
     A video, and a folder with photographs, videos or both, has the layout "photos".
     """
@@ -48,8 +50,12 @@ def detect(path: Path) -> Kind:
     if path.is_file():
         if is_video_name(path):
             return "photos"
+        if survey_of(path) is not None:
+            return "survey"
         if path.suffix.lower() != ".json":
-            raise InputError(f"{path}: is a file, expected a scene's folder, a transforms.json or a video")
+            raise InputError(
+                f"{path}: is a file, expected a scene's folder, a transforms.json, {SURVEY_FILES} or a video"
+            )
         return "blender" if path.name == "transforms_train.json" else "transforms"
     if not path.is_dir():
         raise InputError(f"{path}: no such folder, expected a scene")
@@ -62,11 +68,13 @@ def detect(path: Path) -> Kind:
         return "colmap"
     if (path / "transforms.json").is_file():
         return "transforms"
+    if survey_of(path) is not None:
+        return "survey"
     if find_images(path) or find_videos(path)[0]:
         return "photos"
     raise InputError(
-        f"{path}: no images found, nor sparse/, transforms_train.json or transforms.json; expected a COLMAP, Blender, "
-        "nerfstudio or instant-ngp scene, or a folder of photos or videos"
+        f"{path}: no images found, nor sparse/, transforms_train.json or transforms.json, nor cameras of a survey; "
+        f"expected a COLMAP, Blender, nerfstudio or instant-ngp scene, {SURVEY_FILES}, or a folder of photos or videos"
     )
 
 
@@ -81,20 +89,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
     assert model_path is not None  # `detect` has checked this
     model = colmap.read_model(model_path)
     folder = _picture_folder(path, chosen, model_path, model.images)
-    present = find_images(folder)
-    if not present:
-        raise InputError(f"{folder}: no images found, expected the {len(model.images)} images of {model_path}")
-    listed = [image.name for image in model.images]
-    files = find_pictures(listed, [folder / name for name in listed], folder, model_path, missing, present)
-    names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
-    posed = zip(model.images, names, files, strict=True)
-    model.images = [
-        replace(image, name=name, path=file, listed=legible(image.name))
-        for image, name, file in posed
-        if file is not None
-    ]
-    model.missing = [legible(name) for name, file in zip(listed, files, strict=True) if file is None]
-    _warn_of_unlisted(present, model, model_path, folder)
+    _add_pictures(model, folder, model_path, missing)
     model.images = _held_out(model, model_path / HELD_OUT_LIST_FILE)
     model.clouds = clouds_beside([model_path, path])
     smaller = (
@@ -103,6 +98,54 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
         else [folder.with_name(f"{folder.name}_{factor}") for factor in DOWNSCALED_FOLDER_FACTORS]
     )
     return model, [candidate for candidate in smaller if candidate.is_dir()]
+
+
+def read_survey(path: Path, chosen: str | Path | None, missing: Missing) -> DataSet:
+    """Read the cameras of a survey (`readers.surveys.formats`) and find its pictures.
+
+    chosen, missing: as for `read_colmap`.
+    Raises InputError if the cameras or their pictures cannot be read, and for positions in degrees.
+    """
+    found = survey_of(path)
+    assert found is not None  # `detect` has checked this
+    cameras, top = found.cameras, found.top
+    if chosen is not None and not (top / chosen).is_dir():
+        raise InputError(f"{top / chosen}: no such folder, expected the photographs of {cameras}")
+    data = found.read(None if chosen is None else top / chosen)
+    beside = found.format.is_folder and chosen is None
+    folder = top if beside else _picture_folder(top, chosen, cameras, data.images)
+    _add_pictures(data, folder, cameras, missing, labels=True)
+    data.images = _held_out(data, top / HELD_OUT_LIST_FILE)
+    data.clouds = clouds_beside(list(dict.fromkeys([cameras.parent, top])))
+    return data
+
+
+def _add_pictures(data: DataSet, folder: Path, listed_in: Path, missing: Missing, *, labels: bool = False) -> None:
+    """Set the path of each image, and leave out images without a picture. Warns of pictures that are not listed.
+
+    folder: the folder with the pictures.
+    listed_in: the file or folder with the cameras, for messages.
+    missing: how many pictures may be missing, as for `find_pictures`.
+    labels: True if names without an extension are usual, so that they need no warning.
+    """
+    present = find_images(folder)
+    if not present:
+        raise InputError(f"{folder}: no images found, expected the {len(data.images)} images of {listed_in}")
+    listed = [image.name for image in data.images]
+    # Of two files such as IMG.jpg and IMG.png, which is a mask, the first one in alphabetical order counts.
+    by_label = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(present)}
+    labelled = by_label if labels else {}
+    exact = [labelled.get(name, folder / name) for name in listed]
+    files = find_pictures(listed, exact, folder, listed_in, missing, present)
+    names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
+    posed = zip(data.images, names, files, strict=True)
+    data.images = [
+        replace(image, name=name, path=file, listed=legible(image.name))
+        for image, name, file in posed
+        if file is not None
+    ]
+    data.missing = [legible(name) for name, file in zip(listed, files, strict=True) if file is None]
+    _warn_of_unlisted(present, data, listed_in, folder)
 
 
 def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:

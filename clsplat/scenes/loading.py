@@ -27,9 +27,11 @@ from clsplat.models.edit import decompose
 from clsplat.progress import Progress
 from clsplat.scenes.camera_checks import camera_checks
 from clsplat.scenes.dataset import DataSet, Lens, PosedImage, SceneFrame
-from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transforms
+from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_survey, read_transforms
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
+from clsplat.scenes.readers.colmap import find_model
+from clsplat.scenes.readers.scene_place import georeference_by_gps, georeferenced
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
@@ -66,7 +68,7 @@ def load_scene(
 ) -> Scene:
     """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
-    path: a folder in a layout that `detect` knows, a transforms.json, or a video.
+    path: a folder in a layout that `detect` knows, a transforms.json, a survey's file of cameras, or a video.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
     test_most: maximum number of held-out views. Of more, an even selection is held out. 0 for no maximum.
@@ -187,8 +189,12 @@ def _read(
 
     images, missing, masks, work_dir, frames, progress: as for `load_scene`.
     """
-    if kind in ("blender", "transforms"):
-        return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
+    if kind in ("blender", "transforms", "survey"):
+        if kind == "survey":
+            data = read_survey(path, images, missing)
+        else:
+            data = read_transforms(path, kind, images, missing, masks=masks.masks != "none")
+        return _SceneFiles(georeferenced(data, path, [path if path.is_dir() else path.parent]), path, (), masks)
     folder = path
     if kind == "photos":
         photos = path.resolve()
@@ -196,6 +202,7 @@ def _read(
         folder = reconstruct(photos, folder, masks=for_sfm(masks), frames=frames, progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)
+    data = georeferenced(data, folder, [find_model(folder) or folder, folder])
     return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)
 
 
@@ -258,12 +265,13 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
     scene.missing = tuple(data.missing)
     scene.frame, scene.world_from_files = data.frame, files.world_from_files
+    scene.georeference = data.georeference or georeference_by_gps(data.frame)
     if files.world_from_files is not None:
         scene.file_unit, _, shift = decompose(files.world_from_files)
         scene.bounds = shift - scene.file_unit * cube, shift + scene.file_unit * cube
     if len(scene.points) == 0:
         scene = with_cloud_beside(scene)
-        if not len(scene.points) and kind in ("colmap", "photos"):
+        if not len(scene.points) and kind in ("colmap", "survey", "photos"):
             warn(f"{path}: has no points; training starts from random points")
     if kind != "blender":
         near = [view.camera for view in views if view.name not in scene.stray_cameras]

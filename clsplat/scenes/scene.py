@@ -23,6 +23,7 @@ from clsplat.errors import InputError, reason_of
 from clsplat.files.documents import short_digest
 from clsplat.images.reading import downscale, read_image
 from clsplat.scenes.dataset import SOURCE_FRAME, Lens, SceneFrame, pixels_of, undistort
+from clsplat.scenes.geography.georeference import Georeference
 from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.scenes.supervision.masks import MASK_THRESHOLD, Mask
@@ -197,6 +198,7 @@ class Scene:
     frame: the frame of the scene, relative to the frame that its cameras had first.
     world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
     file_unit: length of a unit of the scene's files, in world units.
+    georeference: where the scene lies on the earth; None if it is unknown.
     """
 
     name: str
@@ -215,6 +217,7 @@ class Scene:
     frame: SceneFrame = SOURCE_FRAME
     world_from_files: Float64 | None = None
     file_unit: float = 1.0
+    georeference: Georeference | None = None
 
     @cached_property
     def train_views(self) -> list[View]:

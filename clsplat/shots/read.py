@@ -29,6 +29,7 @@ from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO, stray_cameras
 from clsplat.scenes.readers import colmap, transforms
 from clsplat.scenes.readers.colmap import find_model, read_cameras
+from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, survey_of
 from clsplat.scenes.readers.transforms import read_poses
 from clsplat.shots.default_orbit import among, cameras_around, parse_up
 from clsplat.shots.generated import PATH_GENERATORS
@@ -42,8 +43,8 @@ from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot, named, numbered, ph
 DEFAULT_PATH_FRAMES = 120
 """Default number of frames of a generated path such as a turntable: five seconds at 24 fps."""
 EXPECTED_CAMERA_SOURCES = (
-    "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a cameras.json of a 3DGS training, a "
-    "clsplat camera file (.json) or a USD stage"
+    f"a COLMAP model's folder, a transforms.json, {SURVEY_FILES}, a nerfstudio camera_path.json, a cameras.json of a "
+    "3DGS training, a clsplat camera file (.json) or a USD stage"
 )
 
 
@@ -70,6 +71,8 @@ def read_shot(
         raise InputError(f"--usd-camera {usd_camera}: {path} is not a USD stage, expected this flag with USD only")
     if path.is_dir():
         return _read_folder(path, size, lenses)
+    if (survey := survey_of(path)) is not None:
+        return Shot(named(cameras_of(survey.images(), lenses)))
     if is_usd:
         return read_usd(path, size, usd_camera)
     if path.suffix.lower() == ".json":
@@ -159,8 +162,9 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
-    """Read the photographs' cameras, with the distortion of their lenses, from a COLMAP model or a transforms.json.
+    """Read the photographs' cameras, with the distortion of their lenses.
 
+    path: a COLMAP model, a transforms.json, or the cameras of a survey.
     size: width and height in pixels, for a transforms.json that gives no size; used only if both are given.
     Raises InputError like `read_shot`, for other sources of cameras, and for panoramas, which cannot be warped from a
     pinhole picture.
@@ -173,12 +177,16 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
             images = colmap.read_images(path)
         elif listed == ["transforms.json"]:
             images = transforms.read_images(path / listed[0], _both(size))
+        elif not listed and (survey := survey_of(path)) is not None:
+            images = survey.images()
+    elif (survey := survey_of(path)) is not None:
+        images = survey.images()
     elif path.suffix.lower() == ".json" and "frames" in _parsed(path):
         images = transforms.read_images(path, _both(size))
     if images is None:
         raise InputError(
-            f"{path}: has no cameras of photographs with their lens distortion, expected a COLMAP model's folder or a "
-            "transforms.json"
+            f"{path}: has no cameras of photographs with their lens distortion, expected a COLMAP model's folder, a "
+            f"transforms.json, or {SURVEY_FILES}"
         )
     if wrong := [image.name for image in images if image.lens.is_panorama]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which cannot be warped from a pinhole picture")
@@ -253,8 +261,11 @@ def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses
             if listed != ["transforms.json"]:
                 raise InputError(f"{path}: holds {examples(listed)}, expected --cameras to name one of them")
             return _read_json(path / listed[0], size, lenses)
-    if is_file(path / CAMERAS_JSON_NAME) and find_model(path) is None:
-        return _read_json(path / CAMERAS_JSON_NAME, size, lenses)
+    if find_model(path) is None:
+        if (survey := survey_of(path)) is not None:
+            return Shot(named(cameras_of(survey.images(), lenses)))
+        if is_file(path / CAMERAS_JSON_NAME):
+            return _read_json(path / CAMERAS_JSON_NAME, size, lenses)
     cameras = read_cameras(path, lenses)
     if not cameras:
         raise InputError(f"{path}: has no images, expected at least one")

@@ -31,6 +31,7 @@ from quality.made_scenes import (
     write_strip,
     write_transforms,
 )
+from quality.survey_formats import survey_formats
 from quality.towns import towns
 from quality.trainings import Rows, picture_of, psnr_of, trained
 from quality.view_orders import orders
@@ -448,6 +449,9 @@ EXPERIMENTS = {
     "orders": Experiment(orders, "+", 3000, {**RESOLUTION, **WITH, **SEEDS}),
     "towns": Experiment(towns, 0, 0, {**WITH, **TOWNS}),
     "sfm": Experiment(sfm_cameras, "+", 2000, {**RESOLUTION, **CAMERAS}),
+    "formats": Experiment(
+        survey_formats, 1, 1000, {**RESOLUTION, **WITH, "--bound": _number(0.05, "largest difference in dB")}
+    ),
     "units": Experiment(units, 1, 300, {**RESOLUTION, "--bound": _number(0.3, "dB")}),
 }
 """The experiments, keyed by name."""

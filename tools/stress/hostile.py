@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
 from hostile_photographs import CAMERA_WRITERS, HAS_CAMERA_DECODERS, make_camera_image
+from hostile_surveys import SURVEYS, XMP_NAMES, make_georeference, make_xmp, read_place
 from hostile_videos import make_frames, make_video, read_frames, read_video
 from ksplats import ksplat
 from models import random_gaussians
@@ -290,9 +291,9 @@ def read_model(path: Path) -> None:
     formats.load(path).check()
 
 
-def read_scene(folder: Path) -> None:
-    """Read all parts of a scene that are read before training: cameras, points and pictures."""
-    scene = load_scene(folder)
+def read_scene(folder: Path, file: str = "") -> None:
+    """Read all parts of a scene that are read before training: cameras, points and pictures. file: its cameras."""
+    scene = load_scene(folder / file)
     if bad := [warning for warning in scene.warnings if not warning.isprintable()]:
         raise AssertionError(f"a warning that is not a plain line: {bad[0][:300]!r}")
     scene.check_pictures()
@@ -420,6 +421,9 @@ _ALL = (
     Reader("scene-places", make_colmap_text, read_scene, tuple(f"images/{name}" for name in PICTURES), PLACES, 0.5),
     Reader("transforms", make_transforms, read_scene, ("transforms.json",), DOCUMENT, 4),
     Reader("blender", make_blender, read_scene, ("transforms_train.json", "transforms_test.json"), DOCUMENT, 2),
+    *(Reader(name, make, partial(read_scene, file=file), (file,), DOCUMENT, 3) for name, make, file in SURVEYS),
+    Reader("xmp", make_xmp, read_scene, XMP_NAMES, TEXT, 3),
+    Reader("georeference", make_georeference, read_place, ("georeference.json",), DOCUMENT),
     *(
         Reader(f"cameras-{kind}", make, partial(read_cameras, name=name), (name,), DOCUMENT, 3)
         for kind, make, name in (

@@ -54,8 +54,8 @@ class RenderVerb(Verb):
     {eye} and %V are left or right."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that contains one. Or a file:
-    transforms.json, nerfstudio's camera_path.json, cameras.json of 3DGS, a clsplat camera file (.json) or a USD stage.
-    docs/cameras.md describes each. Not needed with --path turntable or spiral."""
+    transforms.json, cameras of a survey, nerfstudio's camera_path.json, cameras.json of 3DGS, a clsplat camera file
+    (.json) or a USD stage. docs/cameras.md describes each. Not needed with --path turntable or spiral."""
     transform: Annotated[str | None, arg(metavar="FILE|STEPS|M00,M01,...")] = None
     """Place the model by a 4 x 4 matrix: rotation, uniform scale, translation. Give 16 numbers row by row, a file of
     them, or steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0'. A JSON file can hold key frames or a

@@ -167,4 +167,5 @@ def in_frame(data: DataSet, change: Float64) -> DataSet:
         rotation = image.rotation @ turn.T
         images.append(replace(image, rotation=rotation, translation=scale * image.translation - rotation @ shift))
     box = None  # its sides would not be parallel to the axes of a turned world
-    return replace(data, images=images, points=moved(data.points, change), box=box)
+    place = None if data.georeference is None else data.georeference.moved(change)
+    return replace(data, images=images, points=moved(data.points, change), box=box, georeference=place)

@@ -11,6 +11,7 @@ from clsplat.errors import InputError, warn
 from clsplat.files.atomic import atomic_write, move_into_place, work_folder
 from clsplat.files.documents import is_file
 from clsplat.scenes.dataset import SceneFrame
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, read_georeference
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
 from clsplat.scenes.orientation.new_frame import new_frame
 from clsplat.scenes.readers.colmap import read_model
@@ -80,5 +81,7 @@ def set_frame(scene: Path, photos: Path, use: FrameUse, where: object) -> SceneF
         shutil.copytree(folder, made, ignore=shutil.ignore_patterns(FRAME_RECORD_FILE))
         model.write(made)
         atomic_write(made / FRAME_RECORD_FILE, frame.content())
+        if (place := read_georeference(folder / GEOREFERENCE_FILE)) is not None:
+            atomic_write(made / GEOREFERENCE_FILE, place.moved(change).content())
         move_into_place((made, folder))
     return frame

@@ -17,6 +17,7 @@ from clsplat.files.atomic import move_into_place, work_folder
 from clsplat.files.documents import is_file
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes.camera_json import load_document
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies
 from clsplat.scenes.sfm import focal_lengths
@@ -434,7 +435,8 @@ def _sizes(result: Path) -> dict[str, int]:
     """Return the size in bytes of each file of a result. The keys are paths relative to the result."""
     folders = (result / "images", result / "sparse", result / "masks")
     paths = (path for folder in folders for path in folder.rglob("*"))
-    files = [path for path in sorted(paths) if path.name != FRAME_RECORD_FILE and is_file(path)]
+    records = (FRAME_RECORD_FILE, GEOREFERENCE_FILE)  # they change without the cameras
+    files = [path for path in sorted(paths) if path.name not in records and is_file(path)]
     return {path.relative_to(result).as_posix(): path.stat().st_size for path in files}
 
 

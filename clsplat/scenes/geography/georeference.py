@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""georeference.json, the record of where a scene lies on the earth: a coordinate reference system and a similarity.
+
+The file applies to the coordinates of the files that it lies beside: the cameras of a scene, where users may write it,
+or the model of a run. Beside a model file NAME.splat or the like it is NAME.georeference.json.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.arrays import Float64, numbers
+from clsplat.errors import InputError, examples, warn
+from clsplat.files.documents import is_file, parse_json, read_document
+
+GEOREFERENCE_FILE = "georeference.json"
+"""Name of the record's file."""
+MAX_GEOREFERENCE_BYTES = 1 << 20
+"""Size limit of georeference.json in bytes."""
+GEOCENTRIC_EPSG = 4978
+"""EPSG code of WGS 84 geocentric coordinates (x, y, z in metres from the earth's centre)."""
+GEOCENTRIC_EPSG_CODES = (GEOCENTRIC_EPSG, 4936)
+"""Codes of geocentric systems among GEOGRAPHIC_EPSG_CODES. Their coordinates are metres."""
+GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
+"""EPSG codes whose coordinates are latitude and longitude in degrees, except for GEOCENTRIC_EPSG_CODES."""
+MAX_EPSG_CODE = 1_000_000
+"""Limit of EPSG codes."""
+SIMILARITY_SLACK = 1e-6
+"""Largest relative deviation of a transform from a rotation times a scale. Numbers with 7 digits deviate by less."""
+DOUBTED_MEDIANS, MIN_DOUBTED_METRES = 6.0, 30.0
+"""GPS positions are not used if they are farther from their cameras than the first number times the median distance,
+and than the second number of metres."""
+_EXPECTED_GEOREFERENCE = "the record of where a scene lies on the earth"
+
+
+@dataclass(frozen=True)
+class GpsResiduals:
+    """Distances in metres between the cameras and the GPS positions of their photographs.
+
+    count: number of photographs whose GPS position is used.
+    rms, largest: root mean square and maximum of the distances.
+    """
+
+    count: int
+    rms: float
+    largest: float
+
+    @classmethod
+    def of(cls, where: object, distances: Mapping[str, float]) -> GpsResiduals | None:
+        """Summarise distances in metres by the photographs' names, without positions that are far off; None for none.
+
+        where: the file, for the warning that names photographs whose position is far off.
+        """
+        if not distances:
+            return None
+        limit = max(DOUBTED_MEDIANS * float(np.median([*distances.values()])), MIN_DOUBTED_METRES)
+        if far := [f"{name} by {metres:,.0f} m" for name, metres in distances.items() if metres > limit]:
+            warn(f"{where}: GPS of {len(far):,} photograph(s) is far from the cameras and not used: {examples(far)}")
+        near = np.array([metres for metres in distances.values() if metres <= limit])
+        return cls(len(near), float(np.sqrt(np.mean(near**2))), float(near.max()))
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """Position of a scene or model on the earth: crs = origin + transform @ p, for points p of the scene or model.
+
+    epsg: code of the coordinate reference system, whose coordinates are in metres. 4978 is geocentric.
+    origin: (3,), coordinates of the world's origin in the reference system.
+    transform: (3, 3), rotation times scale from the world to the reference system.
+    residuals: distances of the cameras from GPS positions; None if these are unknown.
+    note: what the georeference comes from, for the user.
+    """
+
+    epsg: int
+    origin: Float64 = field(default_factory=lambda: np.zeros(3))
+    transform: Float64 = field(default_factory=lambda: np.eye(3))
+    residuals: GpsResiduals | None = None
+    note: str = ""
+
+    def moved(self, change: Float64) -> Georeference:
+        """Return the georeference of the scene or model after a change by a similarity (4, 4)."""
+        back = np.linalg.inv(change)
+        transform = self.transform @ back[:3, :3]
+        return replace(self, origin=self.origin + self.transform @ back[:3, 3], transform=transform)
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of georeference.json."""
+        known = self.residuals
+        residuals = None if known is None else {"photographs": known.count, "rms": known.rms, "max": known.largest}
+        return {
+            "epsg": self.epsg,
+            "origin": self.origin.tolist(),
+            "transform": self.transform.tolist(),
+            "gps_residuals": residuals,
+            "note": self.note,
+        }
+
+    def content(self) -> bytes:
+        """Return the content of georeference.json."""
+        return (json.dumps(self.document(), indent=2) + "\n").encode()
+
+
+def on_tangent_plane(place: tuple[float, float, float], note: str, residuals: GpsResiduals | None) -> Georeference:
+    """Return the georeference of a frame with x east, y north and z up, in metres, from a place on WGS 84.
+
+    place: latitude and longitude in degrees, and altitude in metres.
+    """
+    latitude, longitude = np.deg2rad(place[:2])
+    east = [-np.sin(longitude), np.cos(longitude), 0.0]
+    north = [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
+    up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    return Georeference(GEOCENTRIC_EPSG, geocentric_of(place), np.array([east, north, up]).T, residuals, note)
+
+
+def geocentric_of(place: tuple[float, float, float]) -> Float64:
+    """Return geocentric coordinates (3,) of latitude and longitude in degrees and altitude in metres, on WGS 84."""
+    import pycolmap
+
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.ellipsoid_to_ecef(np.array([place], np.float64))[0], np.float64)
+
+
+def place_of(geocentric: Float64) -> tuple[float, float, float]:
+    """Return latitude and longitude in degrees and altitude in metres on WGS 84, of geocentric coordinates (3,)."""
+    import pycolmap
+
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    latitude, longitude, altitude = transform.ecef_to_ellipsoid(np.asarray(geocentric, np.float64)[None])[0].tolist()
+    return latitude, longitude, altitude
+
+
+def beside_model(path: Path) -> Path:
+    """Return the path of the record of a model file."""
+    return path.with_name(f"{path.stem}.{GEOREFERENCE_FILE}")
+
+
+def read_of_model(path: Path) -> Georeference | None:
+    """Read the record of a model file: the file's own, or for model.ply the folder's; None if there is none.
+
+    Raises InputError for a damaged file.
+    """
+    own = read_georeference(beside_model(path))
+    return own if own is not None or path.name != "model.ply" else read_georeference(path.parent / GEOREFERENCE_FILE)
+
+
+def read_georeference(path: Path) -> Georeference | None:
+    """Read the record in the file `path`; None if there is no such file.
+
+    Only `epsg` is required. Without `origin` and `transform` the scene's coordinates are those of the reference system.
+    Raises InputError for a damaged file, and for a reference system in degrees.
+    """
+    if not is_file(path):
+        return None
+    try:
+        document = parse_json(read_document(path, _EXPECTED_GEOREFERENCE, MAX_GEOREFERENCE_BYTES), once=True)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected {_EXPECTED_GEOREFERENCE}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: is not a JSON object, expected one with 'epsg'")
+    origin, transform = (document.get(key) for key in ("origin", "transform"))
+    place = np.zeros(3) if origin is None else numbers(origin)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(f"{path}: 'origin' is {str(origin)[:60]}, expected three numbers")
+    axes = np.eye(3) if transform is None else numbers(transform)
+    if not _is_similarity(axes):
+        raise InputError(f"{path}: 'transform' is {str(transform)[:60]}, expected a rotation times a scale (3 x 3)")
+    note = document.get("note")
+    residuals = _residuals(document.get("gps_residuals"))
+    return Georeference(
+        _epsg(path, document.get("epsg")), place, axes, residuals, note if isinstance(note, str) else ""
+    )
+
+
+def _epsg(path: Path, code: Any) -> int:
+    if isinstance(code, bool) or not isinstance(code, int) or not 0 < code < MAX_EPSG_CODE:
+        found = "has no 'epsg'" if code is None else f"'epsg' is {str(code)[:60]}"
+        raise InputError(f"{path}: {found}, expected the number of an EPSG code, such as 32632")
+    if code in GEOGRAPHIC_EPSG_CODES and code not in GEOCENTRIC_EPSG_CODES:
+        raise InputError(
+            f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "
+            "zone; export the cameras again in such a system"
+        )
+    return code
+
+
+def _residuals(given: Any) -> GpsResiduals | None:
+    values = numbers([given.get(key) for key in ("photographs", "rms", "max")] if isinstance(given, dict) else None)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        return None
+    return GpsResiduals(int(values[0]), float(values[1]), float(values[2]))
+
+
+def _is_similarity(axes: Float64) -> bool:
+    if axes.shape != (3, 3) or not np.isfinite(axes).all():
+        return False
+    squares = axes.T @ axes
+    size = float(np.trace(squares)) / 3
+    return bool(
+        size > 0 and np.linalg.det(axes) > 0 and np.abs(squares - size * np.eye(3)).max() <= SIMILARITY_SLACK * size
+    )
