@@ -399,6 +399,7 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
     assert "step ms" in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_quick")
 def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
     subject = bench_subject.synthetic(300, 50, 40)

@@ -398,6 +398,7 @@ def test_flags_that_the_files_have_no_use_for(shot: list[str], tmp_path: Path, c
     assert "warning: flags without effect on .exr files of these channels: --bits, --background\n" in said
 
 
+@pytest.mark.slow
 def test_a_frame_with_a_hole_is_not_whole(shot: list[str], tmp_path: Path) -> None:
     """Blocks that a machine did not write before it stopped: the last row is there, those in the middle are not."""
     large = ("--width", "400", "--frames", "1", "--exr", "float")

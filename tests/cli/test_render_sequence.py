@@ -225,6 +225,7 @@ def stage_of(folder: Path, name: str, **samples: Gaussians) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_time_samples_of_a_stage(folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(usd, "_lives", lambda *_: True)
     stage_of(folder, "capture", **{f"f{frame}": at(frame) for frame in (1, 2, 4)})

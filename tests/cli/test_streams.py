@@ -68,6 +68,7 @@ def test_closed_streams(line: str, folder: Path) -> None:
     assert closed.returncode == status
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_into_a_file_that_takes_the_place_of_a_stream(folder: Path) -> None:
     assert shell("clsplat convert model.ply new.ply <&- >&- 2>&-", folder).returncode == 0
     assert (folder / "new.ply").read_bytes() == (folder / "model.ply").read_bytes()

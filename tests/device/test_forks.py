@@ -79,6 +79,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.parametrize(("parent", "printed"), [("used", "DeviceError\n"), ("fresh", "")])
 def test_a_fork_by_hand(parent: str, printed: str) -> None:

@@ -92,6 +92,7 @@ def test_passes_keep_what_their_gradients_need(default_device: Device, depth: in
         assert_same_bits(array, alone[name], name)
 
 
+@pytest.mark.slow
 def test_memory_of_a_pass_that_is_gone_is_used_again(default_device: Device) -> None:
     session, flat = session_of(default_device), cloud(50, WIDTH, HEIGHT)
     works = {id(flat.pixels(default_device, WIDTH, HEIGHT)._work) for _ in range(3)}  # what is tested

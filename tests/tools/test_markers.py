@@ -63,6 +63,7 @@ def test_words_narrow_the_drivers_down(monkeypatch: pytest.MonkeyPatch) -> None:
     assert drivers._kept() == every
 
 
+@pytest.mark.slow
 def test_no_driver_of_that_name_is_an_error() -> None:
     options = ["-q", "-p", "xdist", "-p", "no:cacheprovider"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}

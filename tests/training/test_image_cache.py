@@ -100,6 +100,7 @@ def test_memory_that_is_the_host_s_takes_none(scene: Scene, device: Device) -> N
         assert device.memory.used == used
 
 
+@pytest.mark.slow
 def test_training_is_the_same_wherever_they_are(scene: Scene, device: Device) -> None:
     wanted = train(scene, LONG, device=device)
     free = with_memory_of_its_own(device)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calls import noted
+from quick import quick
 from same_bytes import State, opened_again
 from test_visible_chunks import CONFIG, assert_same, state, wide_model
 from tiny import run_steps, short
@@ -108,7 +109,7 @@ def after(steps: int, trainer: Trainer) -> State:
     return found
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", quick(SETTINGS, "growth", "long axis", "pruning"))
 def test_the_bytes_of_a_model_on_the_device(
     scene: Scene, default_device: Device, limits: Limits, whole: dict[str, State], monkeypatch: pytest.MonkeyPatch,
     name: str,
@@ -311,6 +312,7 @@ def test_rows_of_a_large_model_rise(scene: Scene, limits: Limits, monkeypatch: p
     trainer.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory", "devices"), [(5 << 20, 1), (LITTLE, 1), (LITTLE, 2)])
 def test_batches_of_a_pooled_model(scene: Scene, default_device: Device, memory: int, devices: int) -> None:
     """Sums over the views are in main memory, beside the chunks of the pool. It has one slot even if the plan, which

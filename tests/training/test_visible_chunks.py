@@ -250,7 +250,7 @@ def test_steps_that_are_repeated(
     assert_same(got, wanted)
 
 
-@pytest.mark.parametrize("capacity", ["0", "1"])
+@pytest.mark.parametrize("capacity", quick(["0", "1"], "1"))
 def test_a_model_that_grows_into_chunks(
     scene: Scene, default_device: Device, shares: list[float], monkeypatch: pytest.MonkeyPatch, capacity: str
 ) -> None:
