@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,9 +82,7 @@ def kinds(scene: Scene) -> list[str]:
 
 def test_nothing_is_found_where_nothing_is() -> None:
     scene = made()
-    start = time.perf_counter()
     assert findings(scene) == []
-    assert time.perf_counter() - start < 2.0
     answers, config = answered([], TrainConfig())
     assert config == TrainConfig()
     assert paragraph(answers, 24, auto=False) == "inspected 24 photographs: no setting needs to change"
