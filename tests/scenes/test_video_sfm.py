@@ -18,9 +18,12 @@ from pictures import write_pixels
 from tiny import write_scene
 from walk_videos import sliding, walk, write_walk
 
+from clsplat.capture.folder import CaptureFolder
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
+from clsplat.runs.run import Run
 from clsplat.scenes import loading
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.sfm import reconstruct as sfm
@@ -114,6 +117,27 @@ def test_folders_that_clsplat_made_are_left_out(video: Path, tmp_path: Path, tas
         folder,
         tmp_path / "x",
     )
+
+
+def test_runs_and_captures_among_photographs_are_left_out(
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]]
+) -> None:
+    """The renders that a training writes to its run among the photographs leave the result of the photographs valid."""
+    folder = tmp_path / "shots"
+    for index in range(0, COUNT, 4):
+        write_pixels(folder / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
+    scene = tmp_path / "scene"
+    sfm.reconstruct(folder, scene)
+    Run.create(folder / "run", TrainConfig())
+    (folder / "shot").mkdir()
+    CaptureFolder(folder / "shot").claim({"input": [str(video)]}, "capture")
+    for place in ("run/test", "shot/turntable", "kept"):
+        write_pixels(folder / place / "view.png", np.rint(255 * FRAMES[1]).astype(np.uint8))
+    (folder / "kept/config.toml").write_text("[another]\nprogram = 1\n")
+    refuses("from other photos than those now in", sfm.reconstruct, folder, scene)
+    shutil.rmtree(folder / "kept")
+    sfm.reconstruct(folder, scene)
+    assert len(tasks) == 1
 
 
 def test_masks_of_frames(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
