@@ -140,6 +140,28 @@ def test_runs_and_captures_among_photographs_are_left_out(
     assert len(tasks) == 1
 
 
+def test_an_output_that_must_not_be_replaced_is_refused_before_videos_are_decoded(video: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").touch()
+    (tmp_path / "file").touch()
+    for name, told in (("notes", "neither empty nor a result of sfm"), ("file", "a file, expected a folder")):
+        refuses(f"{name}: is {told}", sfm.reconstruct, video, tmp_path / name, frames=6)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "notes"]  # no frames
+
+
+def test_too_few_frames_say_where_they_are(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    """Frames that were taken with a small --frames are used again without it, so that the message says how to go on."""
+    refuses("only 2 photo", sfm.reconstruct, video, tmp_path / "scene", frames=2)
+    told = r"only 2 photo\(s\) found, with 2 frame.*at least 3; remove the frames in .*scene_frames, and give a larger"
+    refuses(told, sfm.reconstruct, video, tmp_path / "scene")
+    shutil.rmtree(tmp_path / "scene_frames")
+    sfm.reconstruct(video, tmp_path / "scene")
+    assert len(tasks) == 1
+    told = "at least 3; give a larger"  # the earlier frames stay
+    refuses(told, sfm.reconstruct, video, tmp_path / "scene", frames=2, overwrite=True)
+    assert len(list((tmp_path / "scene_frames").rglob("*.jpg"))) > 2
+
+
 def test_masks_of_frames(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
     """Masks are found beside the frames whether the video, the folder of its frames, or the video's folder is given."""
     scene, frames = tmp_path / "scene", tmp_path / "scene_frames"
