@@ -135,9 +135,11 @@ def own_cameras(run: Run | None) -> list[Camera]:
     return cameras
 
 
-def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
+def differences(earlier: dict[str, Any], now: dict[str, Any], *, moved: bool = False) -> list[str]:
     """Return short descriptions of the differences between two records of a run's scene: the earlier one and now.
 
+    moved: True if the scene was moved from the frame of its files. The files may have been turned or scaled since, so
+        that the same points are rounded otherwise. Then only the number of points is compared.
     If --resolution has changed, two differences are left out: changed sizes, and changed pixels of a photograph that is
     now read from another file.
     """
@@ -163,7 +165,8 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         if a["split"] != b["split"]:
             changed[held_out].append(name)
     changes = [_listed(what, names) for what, names in changed.items() if names]
-    if earlier["points"] != now["points"] and not changes:
+    same = earlier["points"]["count"] == now["points"]["count"] if moved else earlier["points"] == now["points"]
+    if not same and not changes:
         changes.append(f"other points ({earlier['points']['count']:,} before, {now['points']['count']:,} now)")
     return changes
 
@@ -186,7 +189,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
             "this run; remove it, or go on from it with --accept-changes"
         )
     now = record_of(scene, resolution)
-    changes = differences(earlier, now)
+    changes = differences(earlier, now, moved=scene.world_from_files is not None)
     if changes and not accept:
         raise InputError(
             f"{path}: is not the scene that {run.path} began with: {'; '.join(changes)}; expected the same views and "

@@ -248,6 +248,23 @@ def test_a_run_keeps_its_frame_when_the_scene_gets_another(result: Path) -> None
     assert later.frame is trained.frame
 
 
+def test_a_run_goes_on_when_the_scene_gets_another_frame(result: Path, tmp_path: Path) -> None:
+    """The points have other bits when they are brought back to the run's frame, and are still the same points."""
+    set_frame(result, result / "images", UP, result)
+    run = Run.create(tmp_path / "run", TrainConfig(), scene=result)
+    scene_record.keep(run, load_scene(result), resuming=False)
+    set_frame(result, result / "images", FrameUse(None, "view00,view10=1"), result)
+    scene = load_scene(result, frame=run.frame_to_resume())
+    before = scene_record.read(run)
+    assert before is not None
+    assert before["points"] != scene_record.record_of(scene, 0)["points"]
+    assert not scene_record.check(run, scene, result, 0)
+    scene.points, scene.point_colors = scene.points[1:], scene.point_colors[1:]
+    refuses("other points .400 before, 399 now.", scene_record.check, run, scene, result, 0)
+    # without the run's frame the cameras differ
+    refuses("with another camera", scene_record.check, run, load_scene(result), result, 0)
+
+
 def test_a_run_without_a_frame_has_the_frame_that_the_cameras_had_first(result: Path, tmp_path: Path) -> None:
     """A scene that is turned after a training still fits the model."""
     before, seen = load_scene(result), choose_shot(result).cameras[3]
