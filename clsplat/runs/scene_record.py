@@ -154,7 +154,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any], *, moved: bool = F
     for name in both:
         a, b = was[name], new[name]
         same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
-        turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
+        turned = not _same_pose(a["pose"], b["pose"])
         bent = "radial" in a and (a["projection"] != b.get("projection") or not _close(a["radial"], b["radial"]))
         if turned or bent or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
             changed["with another camera"].append(name)
@@ -237,14 +237,26 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         # the first word of "blake2b" is the digest of the photograph's file, without its mask and known depths
         and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
+    moved = [
+        view.name
+        for view in known
+        if not _same_pose(was[view.name]["pose"], [*np.ravel(view.camera.rotation), *view.camera.translation])
+    ]
     reasons = []
     if seen:
         reasons.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
     if changed:
         reasons.append(_listed("with another photograph than in training", changed))
+    if moved:
+        reasons.append(f"{_listed('with another camera than in training', moved)}: were the cameras recovered again?")
     if was and not known:
         reasons.append(f"none of the views belongs to the scene that {run.path} began with")
     return reasons
+
+
+def _same_pose(a: list[float], b: list[float]) -> bool:
+    """True if two recorded poses, 9 values of rotation and 3 of translation, are equal by `_close`."""
+    return _close(a[:9], b[:9]) and _close(a[9:], b[9:])
 
 
 def _close(a: list[float], b: list[float]) -> bool:

@@ -265,6 +265,9 @@ def test_a_run_goes_on_when_the_scene_gets_another_frame(result: Path, tmp_path:
     refuses("other points .400 before, 399 now.", scene_record.check, run, scene, result, 0)
     # without the run's frame the cameras differ
     refuses("with another camera", scene_record.check, run, load_scene(result), result, 0)
+    assert scene_record.of_evaluation(run, scene.test_views) == []
+    (told,) = scene_record.of_evaluation(run, load_scene(result).test_views)
+    assert told.startswith("3 views with another camera than in training (view00.png, view08.png, view16.png): were")
 
 
 def test_the_bench_of_a_run_draws_its_view_in_the_frame_of_the_model(folder: Path, tmp_path: Path) -> None:
