@@ -23,7 +23,7 @@ MIN_UPRIGHT_CAMERAS = 3
 MAX_PLANE_TILT_RADIANS = np.deg2rad(15.0)
 """Largest angle between a level plane and the cameras' up direction. People hold cameras level to a few degrees."""
 MIN_PLANE_TILT_RADIANS, PLANE_TILT_ROLLS = np.deg2rad(3.0), 2.0
-"""If the cameras are held level, the largest angle is smaller: PLANE_TILT_ROLLS times their median roll, but at least
+"""Limits of this angle for cameras that are held level: PLANE_TILT_ROLLS times their median roll, but at least
 MIN_PLANE_TILT_RADIANS. A plane that is farther from the up direction on which the cameras agree is not level."""
 MAX_PLANE_TILT_BELOW_RADIANS = np.deg2rad(30.0)
 """The same limit if all cameras look down. Their up direction is less exact, as only their view directions give it."""
