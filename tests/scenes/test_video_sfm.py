@@ -134,7 +134,7 @@ def test_runs_and_captures_among_photographs_are_left_out(
     for place in ("run/test", "shot/turntable", "kept"):
         write_pixels(folder / place / "view.png", np.rint(255 * FRAMES[1]).astype(np.uint8))
     (folder / "kept/config.toml").write_text("[another]\nprogram = 1\n")
-    refuses("from other photos than those now in", sfm.reconstruct, folder, scene)
+    refuses("other photos than those now in .*, or replace it with clsplat sfm --overw", sfm.reconstruct, folder, scene)
     shutil.rmtree(folder / "kept")
     sfm.reconstruct(folder, scene)
     assert len(tasks) == 1

@@ -415,7 +415,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
     if not overwrite:
         raise InputError(
             f"{output}: its cameras were recovered with other settings or from other photos than those now in "
-            f"{images}; remove it or choose another folder"
+            f"{images}; remove it, choose another folder, or replace it with clsplat sfm --overwrite"
         )
     _check_replaceable(output)
     return False
