@@ -80,7 +80,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         masks = config.mask_use
-        scene = load_scene_of(config, run.scene, progress=progress)
+        scene = load_scene_of(config, run.scene, frame=run.frame_for(run.scene), progress=progress)
     else:
         scene, masks = load_scene(path, progress=progress), NO_MASKS
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))

@@ -16,10 +16,8 @@ from clsplat.files.documents import is_file
 from clsplat.report import REPORT_FILE_NAME
 from clsplat.runs.run import owned_files
 from clsplat.scenes.camera_json import load_document
+from clsplat.scenes.sfm.captured_files import CAPTURE_RECORD_FILE
 from clsplat.version import package_version
-
-CAPTURE_RECORD_FILE = "capture.json"
-"""File in the output folder that records the call, and the input from which each stage's results were made."""
 
 
 class CaptureFolder:

@@ -22,6 +22,8 @@ MAX_PARSED_BYTES = 1 << 30
 """Most memory in bytes that a file of more than MAX_DOCUMENT_BYTES may take, by `parsed_bytes`."""
 _OBJECT_BYTES = {b"[": 72, b"{": 256, b",": 48, b'"': 32}
 """Most bytes that Python needs for a list, a dict, a value after a comma, and half a text, keyed by their signs."""
+MAX_SETTINGS_BYTES = 1 << 20
+"""Size limit of a run's config.toml in bytes."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 """First bytes of the pointer file that Git LFS leaves in place of a file that was not fetched."""
 MAX_LFS_POINTER_BYTES = 1024
@@ -134,6 +136,15 @@ def parsed_bytes(data: bytes) -> int:
     """
     objects = sum(size * data.count(sign) for sign, size in _OBJECT_BYTES.items())
     return objects + len(data) * (2 if data.isascii() else 5)  # the file, and 1 or up to 4 bytes a character of text
+
+
+def is_settings_of_run(path: Path) -> bool:
+    """True if a file is the config.toml of a run, which clsplat wrote."""
+    try:
+        text = read_document(path, "the settings of a run", MAX_SETTINGS_BYTES)
+    except InputError:
+        return False
+    return any(line.startswith("clsplat = ") for line in text.split("\n"))
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.files.atomic import TEMPORARY_SUFFIX, atomic_write, atomic_writer, remove, write_error
-from clsplat.files.documents import open_input, parse_json, read_document
+from clsplat.files.documents import is_settings_of_run, open_input, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import comment
 from clsplat.models.formats import model_path, ply
@@ -35,7 +35,6 @@ from clsplat.runs.locks import locked
 from clsplat.runs.settings import (
     MAX_METRICS_BYTES,
     MAX_METRICS_LINE_BYTES,
-    MAX_SETTINGS_BYTES,
     config_text,
     read_config,
 )
@@ -353,11 +352,7 @@ def model_file(path: Path) -> Path:
 
 def is_run(path: Path) -> bool:
     """True if the folder holds a config.toml that clsplat wrote."""
-    try:
-        text = read_document(path / "config.toml", "the settings of a run", MAX_SETTINGS_BYTES)
-    except InputError:
-        return False
-    return any(line.startswith("clsplat = ") for line in text.split("\n"))
+    return is_settings_of_run(path / "config.toml")
 
 
 def run_of(model: Path) -> Run | None:

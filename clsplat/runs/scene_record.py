@@ -136,9 +136,11 @@ def own_cameras(run: Run | None) -> list[Camera]:
     return cameras
 
 
-def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
+def differences(earlier: dict[str, Any], now: dict[str, Any], *, moved: bool = False) -> list[str]:
     """Return short descriptions of the differences between two records of a run's scene: the earlier one and now.
 
+    moved: True if the scene was moved from the frame of its files. The files may have been turned or scaled since, so
+        that the same points are rounded otherwise. Then only the number of points is compared.
     If --resolution has changed, two differences are left out: changed sizes, and changed pixels of a photograph that is
     now read from another file.
     """
@@ -153,7 +155,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     for name in both:
         a, b = was[name], new[name]
         same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
-        turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
+        turned = not _same_pose(a["pose"], b["pose"])
         bent = "radial" in a and (a["projection"] != b.get("projection") or not _close(a["radial"], b["radial"]))
         if turned or bent or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
             changed["with another camera"].append(name)
@@ -164,7 +166,8 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         if a["split"] != b["split"]:
             changed[held_out].append(name)
     changes = [_listed(what, names) for what, names in changed.items() if names]
-    if earlier["points"] != now["points"] and not changes:
+    same = earlier["points"]["count"] == now["points"]["count"] if moved else earlier["points"] == now["points"]
+    if not same and not changes:
         changes.append(f"other points ({earlier['points']['count']:,} before, {now['points']['count']:,} now)")
     return changes
 
@@ -187,7 +190,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
             "this run; remove it, or go on from it with --accept-changes"
         )
     now = record_of(scene, resolution)
-    changes = differences(earlier, now)
+    changes = differences(earlier, now, moved=scene.world_from_files is not None)
     if changes and not accept:
         raise InputError(
             f"{path}: is not the scene that {run.path} began with: {'; '.join(changes)}; expected the same views and "
@@ -238,14 +241,26 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         # the first word of "blake2b" is the digest of the photograph's file, without its mask and known depths
         and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
+    moved = [
+        view.name
+        for view in known
+        if not _same_pose(was[view.name]["pose"], [*np.ravel(view.camera.rotation), *view.camera.translation])
+    ]
     reasons = []
     if seen:
         reasons.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
     if changed:
         reasons.append(_listed("with another photograph than in training", changed))
+    if moved:
+        reasons.append(f"{_listed('with another camera than in training', moved)}: were the cameras recovered again?")
     if was and not known:
         reasons.append(f"none of the views belongs to the scene that {run.path} began with")
     return reasons
+
+
+def _same_pose(a: list[float], b: list[float]) -> bool:
+    """True if two recorded poses, 9 values of rotation and 3 of translation, are equal by `_close`."""
+    return _close(a[:9], b[:9]) and _close(a[9:], b[9:])
 
 
 def _close(a: list[float], b: list[float]) -> bool:

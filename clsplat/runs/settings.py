@@ -21,7 +21,7 @@ from clsplat.config.checks import misfit
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
-from clsplat.files.documents import read_document
+from clsplat.files.documents import MAX_SETTINGS_BYTES, read_document
 from clsplat.version import package_version
 
 if sys.version_info >= (3, 11):
@@ -30,8 +30,8 @@ else:
     import tomli as tomllib
 
 
-MAX_SETTINGS_BYTES, MAX_METRICS_BYTES, MAX_METRICS_LINE_BYTES = 1 << 20, 64 << 20, 1 << 16
-"""Size limits in bytes: config.toml, metrics.jsonl, and one line of metrics.jsonl.
+MAX_METRICS_BYTES, MAX_METRICS_LINE_BYTES = 64 << 20, 1 << 16
+"""Size limits in bytes: metrics.jsonl, and one line of metrics.jsonl.
 
 The limit of metrics.jsonl is hundreds of times the output of the longest training.
 """

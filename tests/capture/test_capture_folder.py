@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from calls import refuses
 
-from clsplat.capture.folder import CAPTURE_RECORD_FILE, CaptureFolder
+from clsplat.capture.folder import CaptureFolder
 from clsplat.config.training import TrainConfig
 from clsplat.runs.run import Run
+from clsplat.scenes.sfm.captured_files import CAPTURE_RECORD_FILE
 
 ASKED = {"input": ["/a/walk.mp4"], "iterations": 30}
 

@@ -16,6 +16,7 @@ from calls import refuses
 from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
+from clsplat.bench.workload import load_subject
 from clsplat.config.depth import DepthUse
 from clsplat.config.orientation import FrameUse
 from clsplat.config.points import StartPoints
@@ -30,6 +31,7 @@ from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_fram
 from clsplat.scenes.readers.colmap import read_model
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.sfm.framing import MODEL_FOLDER, scale_new, set_frame, turn_new
+from clsplat.scenes.start.initialise import from_scene
 from clsplat.scenes.start.point_cloud import with_points
 from clsplat.shots import choose_shot
 
@@ -246,6 +248,37 @@ def test_a_run_keeps_its_frame_when_the_scene_gets_another(result: Path) -> None
     later = load_scene(result, frame=trained.frame)
     np.testing.assert_allclose(later.points, trained.points, atol=1e-9)
     assert later.frame is trained.frame
+
+
+def test_a_run_goes_on_when_the_scene_gets_another_frame(result: Path, tmp_path: Path) -> None:
+    """The points have other bits when they are brought back to the run's frame, and are still the same points."""
+    set_frame(result, result / "images", UP, result)
+    run = Run.create(tmp_path / "run", TrainConfig(), scene=result)
+    scene_record.keep(run, load_scene(result), resuming=False)
+    set_frame(result, result / "images", FrameUse(None, "view00,view10=1"), result)
+    scene = load_scene(result, frame=run.frame_to_resume())
+    before = scene_record.read(run)
+    assert before is not None
+    assert before["points"] != scene_record.record_of(scene, 0)["points"]
+    assert not scene_record.check(run, scene, result, 0)
+    scene.points, scene.point_colors = scene.points[1:], scene.point_colors[1:]
+    refuses("other points .400 before, 399 now.", scene_record.check, run, scene, result, 0)
+    # without the run's frame the cameras differ
+    refuses("with another camera", scene_record.check, run, load_scene(result), result, 0)
+    assert scene_record.of_evaluation(run, scene.test_views) == []
+    (told,) = scene_record.of_evaluation(run, load_scene(result).test_views)
+    assert told.startswith("3 views with another camera than in training (view00.png, view08.png, view16.png): were")
+
+
+def test_the_bench_of_a_run_draws_its_view_in_the_frame_of_the_model(folder: Path, tmp_path: Path) -> None:
+    """A scene that the training turned, whose files stay as they are."""
+    scene = load_scene(folder, frame=UP)
+    run = Run.create(tmp_path / "run", TrainConfig(), scene=folder)
+    scene_record.keep(run, scene, resuming=False)
+    run.save_model(from_scene(scene, 100, np.random.default_rng(0)))
+    there, camera = scene.train_views[0].camera, load_subject(run.path).camera
+    np.testing.assert_allclose(camera.rotation, there.rotation, atol=1e-12)  # the frame is read from its record
+    np.testing.assert_allclose(camera.position, there.position, atol=1e-12)
 
 
 def test_a_run_without_a_frame_has_the_frame_that_the_cameras_had_first(result: Path, tmp_path: Path) -> None:

@@ -18,9 +18,12 @@ from pictures import write_pixels
 from tiny import write_scene
 from walk_videos import sliding, walk, write_walk
 
+from clsplat.capture.folder import CaptureFolder
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
+from clsplat.runs.run import Run
 from clsplat.scenes import loading
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.sfm import reconstruct as sfm
@@ -114,6 +117,49 @@ def test_folders_that_clsplat_made_are_left_out(video: Path, tmp_path: Path, tas
         folder,
         tmp_path / "x",
     )
+
+
+def test_runs_and_captures_among_photographs_are_left_out(
+    video: Path, tmp_path: Path, tasks: list[dict[str, Any]]
+) -> None:
+    """The renders that a training writes to its run among the photographs leave the result of the photographs valid."""
+    folder = tmp_path / "shots"
+    for index in range(0, COUNT, 4):
+        write_pixels(folder / f"{index}.png", np.rint(255 * FRAMES[index]).astype(np.uint8))
+    scene = tmp_path / "scene"
+    sfm.reconstruct(folder, scene)
+    Run.create(folder / "run", TrainConfig())
+    (folder / "shot").mkdir()
+    CaptureFolder(folder / "shot").claim({"input": [str(video)]}, "capture")
+    for place in ("run/test", "shot/turntable", "kept"):
+        write_pixels(folder / place / "view.png", np.rint(255 * FRAMES[1]).astype(np.uint8))
+    (folder / "kept/config.toml").write_text("[another]\nprogram = 1\n")
+    refuses("other photos than those now in .*, or replace it with clsplat sfm --overw", sfm.reconstruct, folder, scene)
+    shutil.rmtree(folder / "kept")
+    sfm.reconstruct(folder, scene)
+    assert len(tasks) == 1
+
+
+def test_an_output_that_must_not_be_replaced_is_refused_before_videos_are_decoded(video: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").touch()
+    (tmp_path / "file").touch()
+    for name, told in (("notes", "neither empty nor a result of sfm"), ("file", "a file, expected a folder")):
+        refuses(f"{name}: is {told}", sfm.reconstruct, video, tmp_path / name, frames=6)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "notes"]  # no frames
+
+
+def test_too_few_frames_say_where_they_are(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
+    """Frames that were taken with a small --frames are used again without it, so that the message says how to go on."""
+    refuses("only 2 photo", sfm.reconstruct, video, tmp_path / "scene", frames=2)
+    told = r"only 2 photo\(s\) found, with 2 frame.*at least 3; remove the frames in .*scene_frames, and give a larger"
+    refuses(told, sfm.reconstruct, video, tmp_path / "scene")
+    shutil.rmtree(tmp_path / "scene_frames")
+    sfm.reconstruct(video, tmp_path / "scene")
+    assert len(tasks) == 1
+    told = "at least 3; give a larger"  # the earlier frames stay
+    refuses(told, sfm.reconstruct, video, tmp_path / "scene", frames=2, overwrite=True)
+    assert len(list((tmp_path / "scene_frames").rglob("*.jpg"))) > 2
 
 
 def test_masks_of_frames(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clsplat.errors import InputError
-from clsplat.files.documents import is_file
+from clsplat.files.documents import is_file, is_settings_of_run
 from clsplat.images.reading import cannot_be_searched
 from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.video.frames import frame_sequences
@@ -17,6 +17,11 @@ from clsplat.scenes.video.frames import frame_sequences
 SFM_RECORD_FILE = "sfm.json"
 """File in a result of structure from motion that records its photographs and settings, the photographs without a pose,
 and its quality."""
+CAPTURE_RECORD_FILE = "capture.json"
+"""File in the output folder of a capture that records the call, and the input from which each stage's results were
+made."""
+RECORD_KEYS = {SFM_RECORD_FILE: "fingerprint", CAPTURE_RECORD_FILE: "made"}
+"""A key that each record has, by which it is told from another program's file of the same name."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +39,9 @@ class CapturedFiles:
 def captured_files(folder: Path, excluded: Collection[Path] = ()) -> CapturedFiles:
     """Find the files below a folder.
 
-    Hidden files and folders, and the folders `excluded`, are skipped. Sub-folders with frames that clsplat took from
-    videos, or with a result of structure from motion, are left out with all that is in them: NAME_frames and
-    NAME_colmap. Raises InputError for a folder that cannot be read.
+    Hidden files and folders, and the folders `excluded`, are skipped. Sub-folders that clsplat made are left out with
+    all that is in them: frames of videos, results of structure from motion, runs and captures. Raises InputError for a
+    folder that cannot be read.
     """
     skip = {path.resolve() for path in excluded}
     found = CapturedFiles()
@@ -52,13 +57,14 @@ def captured_files(folder: Path, excluded: Collection[Path] = ()) -> CapturedFil
 
 
 def is_made_by_clsplat(folder: Path) -> bool:
-    """Return True for a folder of frames from videos, and for a result of structure from motion, by their records."""
-    if frame_sequences(folder):
+    """Return True for frames of videos, a result of structure from motion, a run and a capture, by their records."""
+    if frame_sequences(folder) or is_settings_of_run(folder / "config.toml"):
         return True
-    record = folder / SFM_RECORD_FILE
-    if not is_file(record):
-        return False
+    return any(_has_key(folder / name, key) for name, key in RECORD_KEYS.items() if is_file(folder / name))
+
+
+def _has_key(record: Path, key: str) -> bool:
     try:
-        return "fingerprint" in load_document(record, "the record of a result of sfm", "its fingerprint")
+        return key in load_document(record, "a record of clsplat", key)
     except InputError:
         return False

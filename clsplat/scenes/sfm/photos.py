@@ -45,7 +45,7 @@ SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
 UNREADABLE_PHOTO_EXTENSIONS = frozenset({".jp2", ".jxl", ".gif", ".exr"})
 """Extensions of photographs that structure from motion does not use. A warning asks for conversion."""
 MADE_BY_CLSPLAT = "made by clsplat from a video or photos; to use such pictures, give only their folder"
-"""Why folders of frames and results of structure from motion are left out of a search, for messages."""
+"""Why folders that clsplat made are left out of a search (`captured_files`), for messages."""
 
 
 @dataclass(frozen=True)

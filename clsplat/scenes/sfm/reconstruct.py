@@ -148,6 +148,7 @@ def reconstruct(
     """
     report = progress or no_progress
     settings.check()
+    _earlier_record(output)  # raises errors before videos are decoded, which takes minutes
     with frames_of_videos(images, output, frames, report, overwrite=overwrite, folder=frames_to) as videos:
         paths, copies, left_out = _files(images, output, videos)
         mask_files = _masks(images, paths, masks, videos)
@@ -158,7 +159,7 @@ def reconstruct(
             report("using the cameras recovered before", 1.0)
             set_frame(output, images, settings.frame, output)
             return output
-        _require_enough(images, len(paths) + len(videos.paths))
+        _require_enough(images, len(paths) + len(videos.paths), videos)
         _warn_of_left_out(images, left_out)
         workers = threads or os.cpu_count() or 1
         with work_folder(output) as work:
@@ -249,7 +250,7 @@ def _staged_photos(
         warn(f"{images}: {again}")
     photos = videos.by_video(photos)
     photos += videos.staged(target, lambda fraction: report("reading frames", fraction), threads)
-    _require_enough(images, len(photos))
+    _require_enough(images, len(photos), videos)
     return photos
 
 
@@ -348,9 +349,15 @@ class _FoundPhoto:
     path: Path
 
 
-def _require_enough(images: Path, count: int) -> None:
+def _require_enough(images: Path, count: int, videos: VideoFrames) -> None:
     if count < MIN_SFM_PHOTOS:
-        raise InputError(f"{images}: only {count} photo(s) found, expected at least {MIN_SFM_PHOTOS}")
+        found, again = "photo(s) found", ""
+        if videos.paths:
+            found += f", with {len(videos.paths)} frame(s) of videos"
+            again = "; give a larger --frames or none"
+            if videos.made is None:  # the frames stay, and would be used again
+                again = f"; remove the frames in {videos.folder}, and give a larger --frames or none"
+        raise InputError(f"{images}: only {count} {found}, expected at least {MIN_SFM_PHOTOS}{again}")
 
 
 def _masks(images: Path, paths: list[Path], use: MaskUse | None, videos: VideoFrames) -> dict[str, Path]:
@@ -391,16 +398,8 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
     overwrite: True if an earlier result of sfm may be replaced.
     Raises InputError for an output that must not be replaced.
     """
-    if not output.exists():
-        return False
-    if not output.is_dir():
-        raise InputError(f"{output}: is a file, expected a folder for the scene or a new name")
-    try:
-        record = load_document(output / SFM_RECORD_FILE, "the record of a result of sfm", "its fingerprint")
-    except InputError:
-        if any(output.iterdir()):
-            raise InputError(f"{output}: is neither empty nor a result of sfm, expected a new folder") from None
-        _check_replaceable(output)
+    record = _earlier_record(output)
+    if record is None:
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
     files = record.get("files")
@@ -417,10 +416,28 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
     if not overwrite:
         raise InputError(
             f"{output}: its cameras were recovered with other settings or from other photos than those now in "
-            f"{images}; remove it or choose another folder"
+            f"{images}; remove it, choose another folder, or replace it with clsplat sfm --overwrite"
         )
     _check_replaceable(output)
     return False
+
+
+def _earlier_record(output: Path) -> dict[str, Any] | None:
+    """Return the record of an earlier result in the output; None if the output is empty or does not exist.
+
+    Raises InputError for an output with anything else.
+    """
+    if not output.exists():
+        return None
+    if not output.is_dir():
+        raise InputError(f"{output}: is a file, expected a folder for the scene or a new name")
+    try:
+        return load_document(output / SFM_RECORD_FILE, "the record of a result of sfm", "its fingerprint")
+    except InputError:
+        if any(output.iterdir()):
+            raise InputError(f"{output}: is neither empty nor a result of sfm, expected a new folder") from None
+        _check_replaceable(output)
+        return None
 
 
 def _check_replaceable(output: Path) -> None:
