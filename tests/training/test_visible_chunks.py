@@ -483,9 +483,7 @@ def test_a_small_model_keeps_its_order(scene: Scene, default_device: Device, sha
     assert not shares
 
 
-def test_new_rows_stand_behind_their_parents(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_rows_follow_their_parents(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     model = wide_model()
     trainer = Trainer(scene, CONFIG, default_device, model)
     np.testing.assert_array_equal(trainer.parameters["means"].get(), model.means[space_order(model.means)])
