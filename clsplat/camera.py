@@ -37,6 +37,9 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
         ),
         nerfstudio=("perspective",),
         usd=("", "perspective", "pinhole"),
+        opensfm=("", "perspective", "brown", "radial", "simple_radial"),
+        metashape=("frame",),
+        realityscan=("", "perspective", "brown3", "brown3t2", "brown4", "brown4t2"),
         gsplat="pinhole",
     ),
     Orthographic(
@@ -48,6 +51,8 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
         lenses=(LensModel("EQUIRECTANGULAR"),),
         transforms=("EQUIRECTANGULAR",),
         nerfstudio=("equirectangular",),
+        opensfm=("spherical", "equirectangular"),
+        metashape=("spherical",),
     ),
     Fisheye(
         "fisheye",
@@ -61,6 +66,8 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
         ),
         transforms=("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
         nerfstudio=("fisheye",),
+        opensfm=("fisheye", "fisheye_opencv"),
+        metashape=("fisheye", "equidistant_fisheye"),
         gsplat="fisheye",
         ewa="FISHEYE",
     ),

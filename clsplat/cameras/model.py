@@ -85,6 +85,9 @@ class CameraModel:
     transforms: values of `camera_model` in a transforms.json that mean this model.
     nerfstudio: values of `camera_type` in nerfstudio's camera paths that mean this model.
     usd: values of a USD camera's `projection` that mean this model.
+    opensfm: values of `projection_type` in OpenSfM's reconstruction.json that mean this model; "" for a missing one.
+    metashape: types of Metashape's sensors that mean this model.
+    realityscan: values of `DistortionModel` in RealityScan's XMP files that mean this model; "" for a missing one.
     gsplat: the model's name in gsplat, "" if gsplat lacks it.
     ewa: build define that selects the model in kernels/ewa.cl, gsplat's projection; "" if none is needed.
     """
@@ -96,6 +99,9 @@ class CameraModel:
     transforms: tuple[str, ...] = ()
     nerfstudio: tuple[str, ...] = ()
     usd: tuple[str, ...] = ()
+    opensfm: tuple[str, ...] = ()
+    metashape: tuple[str, ...] = ()
+    realityscan: tuple[str, ...] = ()
     gsplat: str = ""
     ewa: str = ""
 

@@ -19,7 +19,6 @@ from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
 from clsplat.models.edit import moved
 from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of, tracked_in_view
 from clsplat.scenes.readers import colmap
-from clsplat.scenes.readers.colmap_points import Tracks
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
 from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
 
@@ -219,7 +218,7 @@ def _maps_in(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _tracks_of(scene: Scene) -> tuple[Path, Tracks] | None:
+def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
     """Return the folder of the COLMAP model that the scene was read from, and its tracks; None for other scenes."""
     model = None if scene.source is None else colmap.find_model(scene.source)
     if model is None:

@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras in the layout that the kernels read (`columns.CAMERA`), and sizes of images in whole tiles."""
+"""Cameras in the layout that the kernels read (`columns.CAMERA`), their upload, and sizes of images in whole tiles."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, Window
+from clsplat.cameras.model import CameraModel
+from clsplat.device.buffers import DeviceArray, upload
+from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.layouts.columns import CAMERA, TILE
 
@@ -59,6 +65,22 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
     rounded = exact.astype(np.float32)
     low = (exact - rounded).astype(np.float32)
     return np.concatenate([rounded, low[: len(CAMERA) - len(_CAMERA_FIELDS)]])
+
+
+@dataclass(frozen=True, eq=False)
+class UploadedCameras:
+    """Cameras of one camera model on the device, (views, CAMERA), relative to the origin of the means."""
+
+    model: CameraModel
+    values: DeviceArray
+
+
+def upload_cameras(device: Device, cameras: Sequence[Camera]) -> list[UploadedCameras]:
+    """Upload cameras, grouped by camera model."""
+    packs: dict[CameraModel, list[NDArray[np.float32]]] = {}
+    for camera in cameras:
+        packs.setdefault(camera.model, []).append(pack_camera(camera))
+    return [UploadedCameras(model, upload(device, np.stack(group))) for model, group in packs.items()]
 
 
 def padded_size(width: int, height: int) -> tuple[int, int]:

@@ -4,38 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from clsplat.camera import Camera
-from clsplat.cameras.model import CameraModel
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.device_camera import UploadedCameras
 from clsplat.stages.device_gaussians import AnyGaussians, parts
 
 SAMPLING_GAUSSIAN_BYTES = 4
 """Bytes per Gaussian for the lower limit of its scales."""
-
-
-@dataclass(frozen=True, eq=False)
-class UploadedCameras:
-    """Cameras of one camera model on the device, (views, CAMERA), relative to the origin of the means."""
-
-    model: CameraModel
-    values: DeviceArray
-
-
-def upload_cameras(device: Device, cameras: Sequence[Camera]) -> list[UploadedCameras]:
-    """Upload cameras, grouped by camera model."""
-    packs: dict[CameraModel, list[NDArray[np.float32]]] = {}
-    for camera in cameras:
-        packs.setdefault(camera.model, []).append(pack_camera(camera))
-    return [UploadedCameras(model, upload(device, np.stack(group))) for model, group in packs.items()]
 
 
 @stage("sampling")

@@ -13,8 +13,9 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
+from clsplat.stages.device_camera import upload_cameras
 from clsplat.stages.device_gaussians import AnyGaussians, HostArray
-from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampling_limits, upload_cameras
+from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampling_limits
 from clsplat.training.step.component import Component, Named
 
 SAMPLING_LIMIT_INTERVAL_STEPS = 100

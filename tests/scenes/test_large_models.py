@@ -19,9 +19,9 @@ from clsplat.errors import InputError
 from clsplat.files import documents
 from clsplat.files.documents import parse_json, parsed_bytes
 from clsplat.scenes.dataset import DataSet
-from clsplat.scenes.readers import colmap_files, colmap_points
-from clsplat.scenes.readers.colmap import _number_of_words, read_images, read_model, read_tracks
-from clsplat.scenes.readers.colmap_points import Tracks
+from clsplat.scenes.readers import colmap, colmap_files
+from clsplat.scenes.readers.colmap import Tracks, read_images, read_model, read_tracks
+from clsplat.scenes.readers.colmap_files import _number_of_words
 from clsplat.scenes.readers.transforms import MAX_TRANSFORMS_BYTES, read_transforms
 from clsplat.scenes.readers.transforms import read_images as read_frames
 
@@ -72,8 +72,8 @@ def write_model(folder: Path, kind: str) -> Path:
 def set_blocks(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     monkeypatch.setattr(colmap_files, "RECORD_BLOCK_BYTES", size)
     monkeypatch.setattr(colmap_files, "TEXT_BLOCK_BYTES", size)
-    monkeypatch.setattr(colmap_points, "OBSERVATION_ROWS", size)
-    monkeypatch.setattr(colmap_points, "COLOUR_ROWS", size)
+    monkeypatch.setattr(colmap, "OBSERVATION_ROWS", size)
+    monkeypatch.setattr(colmap, "COLOUR_ROWS", size)
 
 
 def same(read: tuple[DataSet, Tracks], other: tuple[DataSet, Tracks]) -> None:

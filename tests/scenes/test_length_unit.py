@@ -18,7 +18,7 @@ from clsplat.runs import scene_record
 from clsplat.runs.run import Run
 from clsplat.scenes.depth_sources import DEPTH_TO_UNIT, length_unit_of
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.readers.colmap_points import Tracks
+from clsplat.scenes.readers.colmap import Tracks
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.preparation import prepared
 from clsplat.training.trainer import Trainer

@@ -131,7 +131,11 @@ CHUNK_END = "</chunk>"
         ("<f>40.0</f>", "<f>-3</f>", "focal lengths above 0"),
         ("<f>40.0</f>", "<f>40</f><k4>0.1</k4>", "k4 = 0.1 .*undistorted photographs"),
         ("<f>40.0</f>", "<f>40</f><p3>0.1</p3>", "p3 = 0.1, .*undistorted photographs"),
-        ('type="frame"', 'type="rpc"', "the lens is 'rpc', expected frame"),
+        (
+            'type="frame"',
+            'type="rpc"',
+            "the lens is 'rpc', expected frame, fisheye, equidistant_fisheye, spherical; export undistorted",
+        ),
         ('sensor_id="0"', 'sensor_id="9"', "camera 'view00': its sensor '9' is not among"),
         ('label="view00"><transform>', 'label="view00"><transform>1 ', "camera 'view00': <transform> is .* 16 numbers"),
         ('width="48"', 'width="x"', "its <resolution> is 'x x 32'"),

@@ -146,7 +146,10 @@ def change_shot(part: dict[str, Any], **keys: Any) -> None:
         ),
         (lambda part: change_shot(part, translation=None), "photograph 'view01.png': has no 'translation'"),
         (lambda part: change_shot(part, translation=[1e31, 0, 0]), "'translation' is .* possible size"),
-        (lambda part: part["cameras"]["v2 0"].update(projection_type="dual"), "the lens is 'dual', expected persp"),
+        (
+            lambda part: part["cameras"]["v2 0"].update(projection_type="dual"),
+            "expected perspective, brown, radial, simple_radial, fisheye, fisheye_opencv, spherical, equirectangular;",
+        ),
         (lambda part: part["cameras"]["v2 0"].update(width=0), "'width' is 0, expected a whole number"),
         (lambda part: part["cameras"]["v2 0"].update(focal=-1), "focal lengths above 0"),
         (

@@ -154,7 +154,7 @@ def test_xmp_files_of_two_coordinate_systems_are_refused(tmp_path: Path) -> None
         (
             '"perspective" xcr:DistortionCoeficients="0',
             '"division" xcr:DistortionCoeficients=".1',
-            "'division', expected",
+            "xcr:DistortionModel 'division', expected perspective, brown3, brown3t2, brown4, brown4t2;",
         ),
         (
             '"perspective" xcr:DistortionCoeficients="0 0 0 0',

@@ -16,8 +16,9 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.reference.sampling import sampling_limits as twin
+from clsplat.stages.device_camera import upload_cameras
 from clsplat.stages.device_gaussians import host_gaussians, upload_gaussians
-from clsplat.stages.sampling import limit_scales, sampling_limits, upload_cameras
+from clsplat.stages.sampling import limit_scales, sampling_limits
 
 
 def cameras() -> list[Camera]:

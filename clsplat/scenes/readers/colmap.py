@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of COLMAP models: cameras, images and points3D, binary or text (https://colmap.github.io/format.html).
+"""COLMAP models: where they are, their images, points and tracks, and checks of them. `colmap_files` reads the files.
 
 `pycolmap.Reconstruction` is not used, because version 4.2.1 does not handle damaged files. It fails without naming the
 file, allocates all memory, or accepts a truncated cameras.bin and goes on with uninitialised data. This reader rejects
@@ -11,17 +11,22 @@ Camera models: `colmap_camera_models` in `scenes/dataset.py`.
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Iterator
-from dataclasses import replace
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, warn
-from clsplat.files.documents import is_file, open_input
+from clsplat.files.documents import is_file
+from clsplat.models.codec.values import full_scale
 from clsplat.rotations import rotation_from_quaternion
 from clsplat.scenes.camera_checks import cameras_of
 from clsplat.scenes.dataset import (
@@ -30,33 +35,35 @@ from clsplat.scenes.dataset import (
     Lens,
     PosedImage,
     check_lens,
-    colmap_camera_models,
     given_in_parts,
     in_pixels,
 )
 from clsplat.scenes.orientation.frame_record import read_frame
-from clsplat.scenes.photo_names import is_legible, legible, slashed
+from clsplat.scenes.photo_names import is_legible, legible, match, slashed
 from clsplat.scenes.readers.colmap_files import (
-    COLMAP_COUNT,
-    COLMAP_FILE_KIND,
+    camera_rows,
     check_count,
+    claimed_images,
     corrupt,
     file_of,
-    lines_of,
-    parsing,
-    records,
+    image_rows,
+    point_blocks,
     require_file,
+    rows_of,
+    track_blocks,
+    values_of,
 )
-from clsplat.scenes.readers.colmap_points import Tracks, read_points, read_tracks_of
 
 COLMAP_FILE_STEMS = ("cameras", "images", "points3D")
-OBSERVATION_BYTES = 24  # x, y, id of the point
 EDITED_AFTER_SECONDS = 60.0
 """A text file that is newer than its binary file by more seconds than this counts as edited.
 
 Tools that write or copy both files finish within less time.
 """
-IMAGE_LINE_FIELDS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+COLOUR_ROWS = 1 << 20
+"""Number of points whose colours are converted at once."""
+OBSERVATION_ROWS = 1 << 22
+"""Number of observations that are searched at once."""
 
 
 def find_model(folder: Path) -> Path | None:
@@ -68,7 +75,7 @@ def find_model(folder: Path) -> Path | None:
     for candidate in (folder, folder / "sparse", folder / "colmap" / "sparse"):
         numbered = [path for path in candidate.glob("[0-9]*") if _is_model(path)]
         if len(numbered) > 1:
-            return max(sorted(numbered), key=_claimed_images)
+            return max(sorted(numbered), key=claimed_images)
         if numbered:
             return numbered[0]
         if _is_model(candidate):
@@ -84,7 +91,7 @@ def read_model(folder: Path) -> DataSet:
     fewer records than their headers announce, and of text files newer than the binary file that is read.
     """
     images, points = _read_posed_images(folder), file_of(folder, "points3D")
-    data = DataSet(images, *read_points(points)) if points else DataSet(images)
+    data = DataSet(images, *_read_points(points)) if points else DataSet(images)
     return replace(data, frame=read_frame(folder))
 
 
@@ -121,9 +128,8 @@ def read_tracks(folder: Path) -> Tracks:
     Raises InputError like `read_model`.
     """
     path = require_file(folder, "images")
-    rows = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
-    names = {key: _named(path, name) for key, name, *_ in rows}
-    return read_tracks_of(require_file(folder, "points3D"), names)
+    names = {key: _named(path, name) for key, name, *_ in image_rows(path)}
+    return _tracks_of(require_file(folder, "points3D"), names)
 
 
 def safe_name(name: str) -> bool:
@@ -148,17 +154,6 @@ def _is_model(folder: Path) -> bool:
     return any(file_of(folder, stem) for stem in ("cameras", "images"))
 
 
-def _claimed_images(folder: Path) -> int:
-    """Return the number of images in a model, by images.bin's header or images.txt's lines; -1 without such a file."""
-    path = file_of(folder, "images")
-    if path is None:
-        return -1
-    if path.suffix == ".bin":
-        with open_input(path, COLMAP_FILE_KIND) as file:
-            return int.from_bytes(file.read(8), "little")
-    return sum(1 for _ in _image_lines(path))
-
-
 def _warn_of_newer_text(folder: Path) -> None:
     """Warn of edited text files, which are not read because binary files take precedence."""
     edited = []
@@ -175,7 +170,7 @@ def _read_cameras(folder: Path) -> dict[int, Lens]:
     path = require_file(folder, "cameras")
     lenses: dict[int, Lens] = {}
     in_parts = []
-    for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
+    for key, lens in camera_rows(path):
         if key in lenses:
             raise corrupt(path, f"camera {key} occurs twice")
         lenses[key], parts = in_pixels(check_lens(lens, f"{path}: camera {key}"))
@@ -186,30 +181,10 @@ def _read_cameras(folder: Path) -> dict[int, Lens]:
     return lenses
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    layout, known = struct.Struct("<IiQQ"), colmap_camera_models()
-    for file in records(path, "camera", layout.size):
-        key, model, width, height = (int(value) for value in file.read(layout))
-        if model not in known:
-            raise InputError(
-                f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
-                f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
-            )
-        name, parameters = known[model]
-        yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
-
-
-def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    for number, line in lines_of(path):
-        with parsing(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
-            key, model, width, height, *params = line.split()
-            yield int(key), Lens(model, int(width), int(height), tuple(map(float, params)))
-
-
 def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
     path = require_file(folder, "images")
     images: dict[str, PosedImage] = {}
-    for _, given, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
+    for _, given, camera, pose in image_rows(path):
         if camera not in lenses:
             raise corrupt(path, f"image {given[:80]!r} has the camera {camera}, which is not in the model")
         name = _named(path, given)
@@ -228,56 +203,127 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
     return [images[name] for name in sorted(images)]
 
 
-def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]]:
-    head = struct.Struct("<I7dI")
-    for file in records(path, "image", head.size + 1 + COLMAP_COUNT.size):
-        key, *pose, camera = file.read(head)
-        name = file.name()
-        (observations,) = file.read(COLMAP_COUNT)
-        file.skip(int(observations) * OBSERVATION_BYTES)
-        yield int(key), name, int(camera), tuple(pose)
+def _read_points(path: Path) -> tuple[Float64, Float32]:
+    """Read positions (N, 3) and colours (N, 3) in [0, 1] of the points of points3D.bin or points3D.txt, without tracks.
 
-
-def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield number and text of the first line of each image, and the fields expected in it, for error messages.
-
-    An image's second line, with its observations, may be empty, and some tools omit it.
+    Warns of points with NaN values, which are left out, and of a text file with fewer points than announced. Raises
+    InputError for a damaged file, and for positions and colours that are not possible.
     """
-    after_pose = False
-    for number, line in lines_of(path, keep_empty=True):
-        if after_pose and (not line or _are_observations(line)):
-            after_pose = False
-        elif line:
-            yield (
-                number,
-                line,
-                f"repeated X Y POINT3D_ID, or as {IMAGE_LINE_FIELDS}" if after_pose else IMAGE_LINE_FIELDS,
-            )
-            after_pose = True
+    values, parts = array("d"), [np.empty((0, 3), np.uint8)]
+    for places, colours in point_blocks(path):
+        values.frombytes(places.tobytes())
+        parts.append(colours)
+    points, levels = rows_of(values), np.concatenate(parts)
+    del parts
+    check_count(path, len(points))
+    known = ~(np.isnan(points).any(axis=1) | np.isnan(levels).any(axis=1))
+    if not known.all() and known.any():
+        warn(f"{path}: {np.count_nonzero(~known):,} of {len(points):,} points have NaN values and are left out")
+        points, levels = points[known], levels[known]
+    near = ((points > -MAX_COORDINATE) & (points < MAX_COORDINATE)).all(axis=1)
+    good = near & ((levels >= 0) & (levels <= 65535)).all(axis=1)
+    if not good.all():
+        index = int(np.argmin(good))
+        found = [*points[index].tolist(), *map(float, levels[index])]
+        trouble = f"point {index + 1} of {len(points)} has the position and colour {found}"
+        raise corrupt(path, f"{trouble}, expected finite numbers and colours 0 to 255")
+    return points, _colours(levels)
 
 
-def _are_observations(line: str) -> bool:
-    """Return True for a line of observations (X Y POINT3D_ID ...): its number of words is a multiple of three, and the
-    last word is a number."""
-    try:
-        float(line.rsplit(None, 1)[-1])
-    except ValueError:
-        return False
-    return _number_of_words(line) % 3 == 0
+def _colours(levels: NDArray[Any]) -> Float32:
+    """Return colours (N, 3) in [0, 1]. levels: (N, 3), from 0 to 255; in text files also from 0 to 1 or 65535."""
+    if levels.dtype != np.uint8 and (levels == np.rint(levels)).all():
+        white = full_scale(levels.astype(np.int64))
+    else:
+        white = full_scale(levels)
+    colours = np.empty(levels.shape, np.float32)
+    for first in range(0, len(levels), COLOUR_ROWS):  # divided in float64, which takes much memory
+        rows = slice(first, first + COLOUR_ROWS)
+        colours[rows] = levels[rows] / np.float64(white)
+    return colours
 
 
-def _number_of_words(line: str) -> int:
-    """Return the number of words in a line without blanks at its ends. Lines of observations have tens of thousands."""
-    if line.isascii():
-        codes = np.frombuffer(line.encode(), np.uint8)
-        if not (codes < ord(" ")).any():  # no tabs or the like
-            blank = codes == ord(" ")
-            return 1 + int(np.count_nonzero(blank[:-1] & ~blank[1:]))
-    return len(line.split())
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Observations of points in images.
+
+    points: (N, 3) float64, world coordinates.
+    errors: (N,), mean reprojection errors in pixels.
+    names: the images' names.
+    images: (M,) int32, for each observation the index of its image in `names`; -1 for an image that the model lacks.
+    ends: (N,), for each point the number of observations of this point and of all points before it.
+    """
+
+    points: Float64
+    errors: Float64
+    names: Sequence[str]
+    images: NDArray[np.int32]
+    ends: NDArray[np.int64]
+
+    @cached_property
+    def tracked(self) -> dict[str, int]:
+        """Index in `names` of each image in which points are observed. The keys are names."""
+        counts = np.zeros(len(self.names) + 1, np.int64)
+        for first in range(0, len(self.images), OBSERVATION_ROWS):
+            counts += np.bincount(self.images[first : first + OBSERVATION_ROWS] + 1, minlength=len(counts))
+        return {name: index for index, name in enumerate(self.names) if counts[index + 1]}
+
+    @property
+    def by_image(self) -> dict[str, NDArray[np.int64]]:
+        """For each image with observed points, the indices (k,) of these points, ascending and unique."""
+        return self._rows(self.tracked)
+
+    def shown_in(self, names: Sequence[str]) -> dict[str, NDArray[np.int64]]:
+        """Return the indices (k,) of the points observed in each photograph, by the photograph's name.
+
+        Photographs without observed points are left out.
+
+        names: names of the photographs. `photo_names.match` finds the image of each.
+        """
+        theirs = match(names, self.tracked).names
+        return self._rows({name: self.tracked[other] for name, other in theirs.items()})
+
+    def _rows(self, chosen: Mapping[str, int]) -> dict[str, NDArray[np.int64]]:
+        """Return the indices (k,) of the points in the chosen images, by the names in `chosen`.
+
+        chosen: maps names to indices in `names`.
+        """
+        place = np.full(len(self.names) + 1, -1, np.int32)  # the last is that of images that the model lacks
+        wanted = sorted(set(chosen.values()))
+        place[wanted] = np.arange(len(wanted))
+        places, points = [np.empty(0, np.int32)], [np.empty(0, np.int64)]
+        for first in range(0, len(self.images), OBSERVATION_ROWS):
+            here = place[self.images[first : first + OBSERVATION_ROWS]]
+            found = np.flatnonzero(here >= 0)
+            places.append(here[found])
+            points.append(np.searchsorted(self.ends, first + found, side="right"))
+        of = np.concatenate(places)
+        rows = np.concatenate(points)[np.argsort(of, kind="stable")]
+        parts = np.split(rows, np.cumsum(np.bincount(of, minlength=len(wanted)))[:-1])
+        unique = dict(zip(wanted, map(np.unique, parts), strict=True)) if wanted else {}
+        return {name: unique[index] for name, index in chosen.items()}
 
 
-def _text_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]]:
-    for number, line, expected in _image_lines(path):
-        with parsing(path, number, expected):
-            words = line.split(maxsplit=9)  # the name is the rest of the line, spaces included
-            yield int(words[0]), words[9], int(words[8]), tuple(map(float, words[1:8]))
+def _tracks_of(path: Path, names: Mapping[int, str]) -> Tracks:
+    """Read the points of points3D.bin or points3D.txt with their tracks. Raises InputError for a damaged file.
+
+    names: the images' names, by their ids.
+    """
+    keys = np.array(sorted(key for key in names if abs(key) < 1 << 63), np.int64)
+    places, errors, lengths = array("d"), array("d"), array("q")
+    images = array("i")
+    for points, reprojection, counts, of in track_blocks(path):
+        places.frombytes(points.tobytes())
+        errors.frombytes(reprojection.tobytes())
+        lengths.frombytes(counts.tobytes())
+        images.frombytes(_indices(keys, of).tobytes())
+    listed = [names[key] for key in keys.tolist()]
+    return Tracks(rows_of(places), values_of(errors), listed, values_of(images), np.cumsum(values_of(lengths)))
+
+
+def _indices(keys: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the index of each of `ids` in the sorted `keys`, -1 for ids that are not among them."""
+    if not len(keys):
+        return np.full(len(ids), -1, np.int32)
+    at = np.minimum(np.searchsorted(keys, ids), len(keys) - 1)
+    return np.where(keys[at] == ids, at, -1).astype(np.int32)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a COLMAP model: where they are, records of binary files, lines of text files, and their errors."""
+"""Files of a COLMAP model, binary or text: records, lines, and the cameras, images, points and tracks in them.
+
+The formats are at https://colmap.github.io/format.html. Points and tracks are read in blocks: models have millions.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import is_file, open_input
+from clsplat.scenes.dataset import Lens, colmap_camera_models
 
 COLMAP_COUNT = struct.Struct("<Q")
 MAX_NAME_BYTES = 4096
@@ -31,6 +36,20 @@ RECORD_BLOCK_BYTES = 1 << 22
 """Bytes of a binary file whose records are read at once; more if a record is longer."""
 RECORD_COUNT_COMMENT = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
 COLMAP_FILE_KIND = "a file of a COLMAP model"
+OBSERVATION_BYTES = 24  # x, y, id of the point
+IMAGE_LINE_FIELDS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+POINT_RECORD = np.dtype([("id", "<u8"), ("place", "<f8", 3), ("levels", "u1", 3), ("error", "<f8"), ("length", "<u8")])
+"""Fixed part of a point in points3D.bin. `length` is the number of observations that follow, its track."""
+TRACK_BYTES = 8  # id of the image, index of the observation in it
+POINT_LINE_FIELDS = "POINT3D_ID X Y Z R G B ERROR TRACK"
+GREY_LEVELS = ["128", "128", "128"]
+"""Colour of points that have none in a text file."""
+ImageRow = tuple[int, str, int, tuple[float, ...]]
+"""An image: its id, name and camera's id, and its pose: QW QX QY QZ TX TY TZ."""
+PointBlock = tuple[Float64, NDArray[Any]]
+"""Some points: positions (k, 3), and colours (k, 3) from 0 to 255, as uint8 if they are such numbers."""
+TrackBlock = tuple[Float64, Float64, NDArray[np.int64], NDArray[np.int64]]
+"""Some points: positions (k, 3), reprojection errors (k,), lengths (k,) of the tracks, and image ids of all tracks."""
 
 
 class Records:
@@ -86,19 +105,30 @@ class Records:
             raise corrupt(self.path, f"{self.left} bytes follow the last of its {number} {what}s")
 
 
+@contextmanager
+def _opened(path: Path, what: str, least: int) -> Iterator[tuple[Records, int]]:
+    """Context manager that opens a binary file and yields a reader behind the header, and the number of records.
+
+    what, least: as for `records`.
+    At the end, raises InputError if bytes follow the last record.
+    """
+    with open_input(path, COLMAP_FILE_KIND) as opened:
+        file = Records(path, opened)
+        number = file.count(what, least)
+        yield file, number
+        file.end(what, number)
+
+
 def records(path: Path, what: str, least: int) -> Iterator[Records]:
     """Yield a reader at the beginning of each record that the file's header announces.
 
     what: the kind of record, for messages.
     least: minimum number of bytes of a record.
     """
-    with open_input(path, COLMAP_FILE_KIND) as opened:
-        file = Records(path, opened)
-        number = file.count(what, least)
+    with _opened(path, what, least) as (file, number):
         for index in range(number):
             file.doing = f"{what} {index + 1} of {number}"
             yield file
-        file.end(what, number)
 
 
 def record_blocks(
@@ -115,9 +145,7 @@ def record_blocks(
     """
     head, length_at = layout.itemsize, COLMAP_COUNT.unpack_from
     number, kept, least = 0, b"", head
-    with open_input(path, COLMAP_FILE_KIND) as opened:
-        file = Records(path, opened)
-        total = file.count(what, head)
+    with _opened(path, what, head) as (file, total):
         while number < total:
             file.doing = f"{what} {number + 1} of {total}"
             file.need(least - len(kept))
@@ -138,7 +166,6 @@ def record_blocks(
             if begins:
                 yield data, np.frombuffer(begins, np.int64)
         file.left += len(kept)
-        file.end(what, total)
 
 
 def at_each(data: bytes, begins: NDArray[np.int64], layout: np.dtype[Any]) -> NDArray[Any]:
@@ -235,3 +262,178 @@ def parsing(path: Path, number: int, expected: str) -> Iterator[None]:
 def unreadable(path: Path, number: int, expected: str) -> InputError:
     """Return the error for line `number` of a text file. expected: the fields of a valid line."""
     return InputError(f"{path}: line {number} does not read as {expected}; is the file damaged?")
+
+
+def camera_rows(path: Path) -> Iterator[tuple[int, Lens]]:
+    """Yield id and lens of each camera of cameras.bin or cameras.txt."""
+    return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    layout, known = struct.Struct("<IiQQ"), colmap_camera_models()
+    for file in records(path, "camera", layout.size):
+        key, model, width, height = (int(value) for value in file.read(layout))
+        if model not in known:
+            raise InputError(
+                f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
+                f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
+            )
+        name, parameters = known[model]
+        yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for number, line in lines_of(path):
+        with parsing(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
+            key, model, width, height, *params = line.split()
+            yield int(key), Lens(model, int(width), int(height), tuple(map(float, params)))
+
+
+def claimed_images(folder: Path) -> int:
+    """Return the number of images in a model, by images.bin's header or images.txt's lines; -1 without such a file."""
+    path = file_of(folder, "images")
+    if path is None:
+        return -1
+    if path.suffix == ".bin":
+        with open_input(path, COLMAP_FILE_KIND) as file:
+            return int.from_bytes(file.read(8), "little")
+    return sum(1 for _ in _image_lines(path))
+
+
+def image_rows(path: Path) -> Iterator[ImageRow]:
+    """Yield the images of images.bin or images.txt, without their observations."""
+    return _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+
+
+def _binary_images(path: Path) -> Iterator[ImageRow]:
+    head = struct.Struct("<I7dI")
+    for file in records(path, "image", head.size + 1 + COLMAP_COUNT.size):
+        key, *pose, camera = file.read(head)
+        name = file.name()
+        (observations,) = file.read(COLMAP_COUNT)
+        file.skip(int(observations) * OBSERVATION_BYTES)
+        yield int(key), name, int(camera), tuple(pose)
+
+
+def _text_images(path: Path) -> Iterator[ImageRow]:
+    for number, line, expected in _image_lines(path):
+        with parsing(path, number, expected):
+            words = line.split(maxsplit=9)  # the name is the rest of the line, spaces included
+            yield int(words[0]), words[9], int(words[8]), tuple(map(float, words[1:8]))
+
+
+def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Yield number and text of the first line of each image, and the fields expected in it, for error messages.
+
+    An image's second line, with its observations, may be empty, and some tools omit it.
+    """
+    after_pose = False
+    for number, line in lines_of(path, keep_empty=True):
+        if after_pose and (not line or _are_observations(line)):
+            after_pose = False
+        elif line:
+            yield (
+                number,
+                line,
+                f"repeated X Y POINT3D_ID, or as {IMAGE_LINE_FIELDS}" if after_pose else IMAGE_LINE_FIELDS,
+            )
+            after_pose = True
+
+
+def _are_observations(line: str) -> bool:
+    """Return True for a line of observations (X Y POINT3D_ID ...): its number of words is a multiple of three, and the
+    last word is a number."""
+    try:
+        float(line.rsplit(None, 1)[-1])
+    except ValueError:
+        return False
+    return _number_of_words(line) % 3 == 0
+
+
+def _number_of_words(line: str) -> int:
+    """Return the number of words in a line without blanks at its ends. Lines of observations have tens of thousands."""
+    if line.isascii():
+        codes = np.frombuffer(line.encode(), np.uint8)
+        if not (codes < ord(" ")).any():  # no tabs or the like
+            blank = codes == ord(" ")
+            return 1 + int(np.count_nonzero(blank[:-1] & ~blank[1:]))
+    return len(line.split())
+
+
+def point_blocks(path: Path) -> Iterator[PointBlock]:
+    """Yield the points of points3D.bin or points3D.txt in blocks, without their tracks."""
+    return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
+
+
+def _binary_points(path: Path) -> Iterator[PointBlock]:
+    for data, begins in record_blocks(path, "point", POINT_RECORD, TRACK_BYTES, whole=False):
+        points = at_each(data, begins, POINT_RECORD)
+        yield points["place"], points["levels"].copy()  # a copy, as a view keeps all fields
+
+
+def _text_points(path: Path) -> Iterator[PointBlock]:
+    for first, lines in line_blocks(path):
+        values, number = array("d"), first
+        try:
+            for number, line in enumerate(lines, first):  # noqa: B007  # for the error
+                if not line or line[0] == "#":
+                    continue
+                words = line.split(None, 8)
+                if len(words) == 4:
+                    words += GREY_LEVELS
+                if len(words) < 7:  # some tools omit error and track
+                    raise ValueError("a point has a position and a colour")
+                if len(words) == 9 and len(words[8].split()) % 2:
+                    raise ValueError("a track consists of pairs")
+                values.extend(map(float, words[1:7]))
+        except (ValueError, OverflowError):
+            raise unreadable(path, number, POINT_LINE_FIELDS) from None
+        table = values_of(values).reshape(-1, 6)
+        with np.errstate(invalid="ignore"):
+            levels = table[:, 3:].astype(np.uint8)
+        yield table[:, :3], levels if (levels == table[:, 3:]).all() else table[:, 3:].copy()
+
+
+def track_blocks(path: Path) -> Iterator[TrackBlock]:
+    """Yield the points of points3D.bin or points3D.txt in blocks, with their tracks."""
+    return _binary_tracks(path) if path.suffix == ".bin" else _text_tracks(path)
+
+
+def _binary_tracks(path: Path) -> Iterator[TrackBlock]:
+    for data, begins in record_blocks(path, "point", POINT_RECORD, TRACK_BYTES, whole=True):
+        points = at_each(data, begins, POINT_RECORD)
+        lengths = points["length"].astype(np.int64)
+        firsts = begins + POINT_RECORD.itemsize - TRACK_BYTES * (np.cumsum(lengths) - lengths)
+        each = np.repeat(firsts, lengths) + TRACK_BYTES * np.arange(lengths.sum())
+        yield points["place"], points["error"], lengths, at_each(data, each, np.dtype("<u4")).astype(np.int64)
+
+
+def _text_tracks(path: Path) -> Iterator[TrackBlock]:
+    for first, lines in line_blocks(path):
+        places, errors, lengths, images, number = array("d"), array("d"), array("q"), array("q"), first
+        try:
+            for number, line in enumerate(lines, first):  # noqa: B007  # for the error
+                if not line or line[0] == "#":
+                    continue
+                words = line.split(None, 8)
+                if len(words) < 7 and len(words) != 4:
+                    raise ValueError("a point has a position and a colour")
+                track = words[8].split()[::2] if len(words) == 9 else []
+                places.extend(map(float, words[1:4]))
+                errors.append(float(words[7]) if len(words) > 7 else 0.0)
+                lengths.append(len(track))
+                images.extend(map(int, track))
+        except (ValueError, OverflowError):
+            raise unreadable(path, number, POINT_LINE_FIELDS) from None
+        yield rows_of(places), values_of(errors), values_of(lengths), values_of(images)
+
+
+def rows_of(values: array[float]) -> Float64:
+    """Return numbers in rows of three (N, 3), in the memory of `values`."""
+    rows: Float64 = values_of(values).reshape(-1, 3)
+    return rows
+
+
+def values_of(values: array[Any]) -> NDArray[Any]:
+    """Return numbers (N,) in the memory of `values`."""
+    return np.frombuffer(values, values.typecode) if values else np.empty(0, values.typecode)

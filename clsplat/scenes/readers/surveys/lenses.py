@@ -5,7 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clsplat.camera import model_with, names_of
+from clsplat.cameras.model import CameraModel
 from clsplat.errors import InputError
+from clsplat.scenes.camera_json import short
 from clsplat.scenes.dataset import Lens, check_lens
 
 UNDISTORTED_ADVICE = "export undistorted photographs and their cameras instead"
@@ -59,17 +62,23 @@ class SurveyLens:
         return check_lens(Lens(model, self.width, self.height, (*self.focal, *self.centre, *distortion)), where)
 
 
-def panorama(width: int, height: int, where: str) -> Lens:
+def panorama(model: CameraModel, width: int, height: int, where: str) -> Lens:
     """Return the lens of a full panorama. Raises InputError for an invalid size.
 
+    model: a camera model of panoramas.
     where: beginning of the error message.
     """
-    return check_lens(Lens("EQUIRECTANGULAR", width, height, (float(width), float(height))), where)
+    return check_lens(Lens(model.lenses[0].name, width, height, (float(width), float(height))), where)
 
 
-def unsupported(where: str, kind: str, known: str) -> InputError:
-    """Return the error for a lens of a kind that is not supported.
+def model_of_kind(program: str, kind: str, where: str, key: str = "") -> CameraModel:
+    """Return the camera model of a kind of lens in a survey program's file. Raises InputError for an unsupported kind.
 
-    where: beginning of the message. kind: the kind in the file. known: supported kinds, in words.
+    program: attribute of CameraModel with the program's names.
+    where: beginning of the error message. key: text before the kind in the message.
     """
-    return InputError(f"{where}: the lens is {kind}, expected {known}; {UNDISTORTED_ADVICE}")
+    model = model_with(program, kind)
+    if model is None:
+        known = ", ".join(filter(None, names_of(program)))
+        raise InputError(f"{where}: the lens is {key}{short(kind)}, expected {known}; {UNDISTORTED_ADVICE}")
+    return model

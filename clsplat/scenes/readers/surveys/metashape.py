@@ -34,14 +34,12 @@ from clsplat.scenes.geography.georeference import (
     on_tangent_plane,
     place_of,
 )
-from clsplat.scenes.readers.surveys.lenses import UNDISTORTED_ADVICE, SurveyLens, panorama, unsupported
+from clsplat.scenes.readers.surveys.lenses import UNDISTORTED_ADVICE, SurveyLens, model_of_kind, panorama
 from clsplat.scenes.readers.surveys.names import inner_name
 
 METASHAPE_HEAD_BYTES = 4096
 """Number of bytes at the beginning of an XML file by which Metashape's cameras are recognised."""
 EXPECTED_METASHAPE = "Metashape's cameras (.xml)"
-FRAME_KINDS, FISHEYE_KINDS, SPHERICAL_KIND = ("frame",), ("fisheye", "equidistant_fisheye"), "spherical"
-"""Types of sensors that are read."""
 MAX_SKEW_SHIFT_PX = 0.5
 """Largest shift of a pixel, in pixels, by the skew b2 that is left out."""
 EARTH_RADII = 6.2e6, 6.5e6
@@ -167,13 +165,12 @@ class _Sensors:
         found = sensor.findall("calibration")
         adjusted = [each for each in found if each.get("class") == "adjusted"]
         calibration = next(iter([*adjusted, *found]), None)
-        kind = (sensor if calibration is None else calibration).get("type") or sensor.get("type", "frame")
+        kind = (sensor if calibration is None else calibration).get("type", "") or sensor.get("type", "frame")
         sizes = [None if calibration is None else calibration.find("resolution"), sensor.find("resolution")]
         width, height = _size(next((each for each in sizes if each is not None), None), where)
-        if kind == SPHERICAL_KIND:
-            return panorama(width, height, where)
-        if kind not in (*FRAME_KINDS, *FISHEYE_KINDS):
-            raise unsupported(where, short(kind), ", ".join((*FRAME_KINDS, *FISHEYE_KINDS, SPHERICAL_KIND)))
+        model = model_of_kind("metashape", kind, where)
+        if model.wraps:
+            return panorama(model, width, height, where)
         if calibration is None:
             raise InputError(f"{where}: has no <calibration>; align the photographs and export the cameras again")
         values = _Calibration(calibration, where)
@@ -191,7 +188,7 @@ class _Sensors:
             (width / 2 + cx, height / 2 + cy),
             (values.get("k1"), values.get("k2"), values.get("k3"), values.get("k4")),
             (values.get("p2"), values.get("p1")),
-            is_fisheye=kind in FISHEYE_KINDS,
+            is_fisheye=not model.flat,
         ).lens(where)
         self._check_skew(values.get("b2"), (height / 2 + abs(cy)) / focal, where)
         return lens

@@ -20,7 +20,7 @@ from clsplat.files.documents import is_file, open_input, parse_json, read_docume
 from clsplat.scenes.camera_json import EXPORT_AGAIN_ADVICE, Keys, short
 from clsplat.scenes.dataset import MAX_COORDINATE, DataSet, Lens, PosedImage
 from clsplat.scenes.geography.georeference import Georeference, GpsResiduals, on_tangent_plane
-from clsplat.scenes.readers.surveys.lenses import SurveyLens, panorama, unsupported
+from clsplat.scenes.readers.surveys.lenses import SurveyLens, model_of_kind, panorama
 from clsplat.scenes.readers.surveys.names import inner_name
 
 RECONSTRUCTION_FILE = "reconstruction.json"
@@ -37,12 +37,11 @@ NO_GPS_DOP = 1e5
 """`gps_dop` from which on a photograph counts as without GPS. OpenSfM writes 999999 for such photographs."""
 MAX_PLANE_METRES = 1e5
 """Largest distance of the cameras from the place of the world's origin. The earth falls by 800 m over this distance."""
-ONE_FOCAL_KINDS = ("perspective", "fisheye")
-"""Values of `projection_type` with one focal length, and the principal point in the middle."""
 TWO_FOCAL_KINDS = ("brown", "radial", "simple_radial", "fisheye_opencv")
-"""Values of `projection_type` with two focal lengths and a principal point."""
-PANORAMA_KINDS = ("spherical", "equirectangular")
-"""Values of `projection_type` of panoramas."""
+"""Values of `projection_type` with two focal lengths and a principal point.
+
+All others have one focal length, and the principal point in the middle.
+"""
 EXPECTED_RECONSTRUCTION = "OpenSfM's or WebODM's reconstruction.json"
 
 
@@ -109,16 +108,14 @@ def _objects(path: Path, part: dict[str, Any], key: str) -> dict[str, dict[str, 
 
 def _lens(keys: Keys) -> Lens:
     width, height = keys.side("width"), keys.side("height")
-    kind = "perspective" if keys.get("projection_type") is None else keys.text("projection_type")
-    if kind in PANORAMA_KINDS:
-        return panorama(width, height, keys.where)
-    known = (*ONE_FOCAL_KINDS, *TWO_FOCAL_KINDS)
-    if kind not in known:
-        raise unsupported(keys.where, short(kind), ", ".join((*known, *PANORAMA_KINDS)))
+    kind = "" if keys.get("projection_type") is None else keys.text("projection_type")
+    model = model_of_kind("opensfm", kind, keys.where)
+    if model.wraps:
+        return panorama(model, width, height, keys.where)
     longer = max(width, height)
-    one = kind in ONE_FOCAL_KINDS
-    focal = tuple(longer * keys.require(key) for key in (("focal", "focal") if one else ("focal_x", "focal_y")))
-    centre = (0.0, 0.0) if one else (keys.require("c_x", 0.0), keys.require("c_y", 0.0))
+    two = kind in TWO_FOCAL_KINDS
+    focal = tuple(longer * keys.require(key) for key in (("focal_x", "focal_y") if two else ("focal", "focal")))
+    centre = (keys.require("c_x", 0.0), keys.require("c_y", 0.0)) if two else (0.0, 0.0)
     k1, k2, k3, k4, p1, p2 = (keys.require(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     return SurveyLens(
         width,
@@ -127,7 +124,7 @@ def _lens(keys: Keys) -> Lens:
         (longer * centre[0] + width / 2, longer * centre[1] + height / 2),
         (k1, k2, k3, k4),
         (p1, p2),
-        is_fisheye=kind.startswith("fisheye"),
+        is_fisheye=not model.flat,
     ).lens(keys.where)
 
 

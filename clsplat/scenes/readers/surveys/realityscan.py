@@ -11,6 +11,7 @@ The size of a photograph is not in its XMP file, but in the photograph's header.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +27,7 @@ from clsplat.files.xml_documents import read_xml
 from clsplat.images.reading import find_images, image_size
 from clsplat.scenes.camera_json import short
 from clsplat.scenes.dataset import MAX_COORDINATE, DataSet, Lens, PosedImage
-from clsplat.scenes.readers.surveys.lenses import UNDISTORTED_ADVICE, SurveyLens, unsupported
+from clsplat.scenes.readers.surveys.lenses import UNDISTORTED_ADVICE, SurveyLens, model_of_kind
 
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 """Namespace of RealityScan's values."""
@@ -40,8 +41,8 @@ EXPECTED_XMP = "RealityScan's XMP file"
 XMP_FILES = "a folder of photographs with RealityScan's XMP files"
 FRAME_WIDTH_MM = 36.0
 """Width of a picture on 35 mm film, to which `FocalLength35mm` refers."""
-RADIAL_TERMS = {"perspective": 0, "brown3": 3, "brown3t2": 3, "brown4": 4, "brown4t2": 4}
-"""Number of radial coefficients of each `DistortionModel` that is read. Names that end in t2 have t1 and t2 too."""
+BROWN_MODEL = re.compile(r"brown(\d)(t2)?")
+"""Pattern of each `DistortionModel` that has coefficients: the number of radial ones, and t2 if t1 and t2 are used."""
 XMP_ROTATION_SLACK = 1e-3
 """Largest deviation of `Rotation` from a rotation. Files have 15 digits; edited ones fewer."""
 XMP_PATTERN = "*.[xX][mM][pP]"
@@ -150,12 +151,10 @@ class _Xmp:
     def lens(self, width: int, height: int) -> Lens:
         """Return the lens at a photograph's size in pixels."""
         where = str(self.path)
-        model = self.text("DistortionModel") or "perspective"
+        kind = self.text("DistortionModel") or ""
         coefficients = self.numbers("DistortionCoeficients", 6, 0.0)  # sic
-        if not coefficients.any():
-            model = "perspective"
-        if model not in RADIAL_TERMS:
-            raise unsupported(where, f"xcr:DistortionModel {short(model)}", ", ".join(RADIAL_TERMS))
+        if coefficients.any():
+            model_of_kind("realityscan", kind, where, "xcr:DistortionModel ")
         if skew := float(self.numbers("Skew", 1, 0.0)[0]):
             raise InputError(
                 f"{where}: xcr:Skew is {skew:g}, expected 0, as no lens model here has a skew; {UNDISTORTED_ADVICE}, "
@@ -167,8 +166,9 @@ class _Xmp:
             float(self.numbers(key, 1, value)[0])
             for key, value in (("AspectRatio", 1.0), ("PrincipalPointU", 0.0), ("PrincipalPointV", 0.0))
         )
-        used = np.arange(6) < RADIAL_TERMS[model]
-        used[4:] = model.endswith("t2")
+        brown = BROWN_MODEL.fullmatch(kind)
+        used = np.arange(6) < (int(brown[1]) if brown else 0)
+        used[4:] = bool(brown and brown[2])
         k1, k2, k3, k4, t1, t2 = np.where(used, coefficients, 0.0).tolist()
         centre = (width / 2 + longer * x, height / 2 + longer * y)
         return SurveyLens(width, height, (focal, focal * aspect), centre, (k1, k2, k3, k4), (t2, t1)).lens(where)
