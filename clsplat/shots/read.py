@@ -185,8 +185,8 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
         images = transforms.read_images(path, _both(size))
     if images is None:
         raise InputError(
-            f"{path}: has no cameras of photographs with their lens distortion, expected a COLMAP model's folder, a "
-            f"transforms.json, or {SURVEY_FILES}"
+            f"{path}: has no cameras of photographs with their lens distortion, expected {SURVEY_FILES}, a COLMAP "
+            "model's folder or a transforms.json"
         )
     if wrong := [image.name for image in images if image.lens.is_panorama]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which cannot be warped from a pinhole picture")

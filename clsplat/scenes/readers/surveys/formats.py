@@ -58,8 +58,8 @@ SURVEY_FORMATS = (
     SurveyFormat(XMP_FILES, find_xmp, lambda _: False, read_xmp, is_folder=True),
 )
 """Every survey format, in the order in which a folder is searched."""
-SURVEY_FILES = " or ".join(row.name for row in SURVEY_FORMATS)
-"""The files in words, for messages."""
+SURVEY_FILES = ", ".join(row.name for row in SURVEY_FORMATS)
+"""The files in words, for a list in messages."""
 
 
 class Survey(NamedTuple):
