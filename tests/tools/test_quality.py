@@ -131,7 +131,9 @@ def test_choices_of_cameras_are_settings() -> None:
     asked = camera_choices.settings_of("mapper=auto,matching=exhaustive", 3)
     assert asked == SfmSettings(mapper="auto", matching="exhaustive", seed=3)
     assert camera_choices.settings_of("auto", 0) == SfmSettings()
+    assert camera_choices.settings_of("max_features=100", 0).max_features == 100
     refuses("'mappers' is no setting", camera_choices.settings_of, "mappers=global", 0)
+    refuses("expected a number of features", camera_choices.settings_of, "max_features=all", 0)
 
 
 def write_binary(folder: Path) -> Path:

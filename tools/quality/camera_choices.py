@@ -28,9 +28,11 @@ def settings_of(choice: str, seed: int) -> SfmSettings:
     changes: dict[str, Any] = {}
     for entry in [] if choice == "auto" else choice.split(","):
         name, _, value = entry.partition("=")
-        if name not in ("matching", "mapper", "features", "weights", "camera_model"):
+        if name not in ("matching", "mapper", "features", "weights", "camera_model", "max_features"):
             raise InputError(f"--choices {choice}: {name!r} is no setting, expected one such as matching=exhaustive")
-        changes[name] = value
+        if name == "max_features" and not value.isdecimal():
+            raise InputError(f"--choices {choice}: expected a number of features, such as max_features=8192")
+        changes[name] = int(value) if name == "max_features" else value
     settings = SfmSettings(seed=seed, **changes)
     settings.check()
     return settings
