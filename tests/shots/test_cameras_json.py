@@ -157,7 +157,7 @@ def test_lists_that_cannot_be(document: Any, message: str, tmp_path: Path) -> No
 
 
 def test_they_have_no_lenses_to_bend_by(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="lens distortion, expected a COLMAP model's folder"):
+    with pytest.raises(InputError, match=r"lens distortion, expected .*, a COLMAP model's folder or a transforms"):
         choose_shot(write(tmp_path / "cameras.json", [camera()]), distort=True)
 
 
