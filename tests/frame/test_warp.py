@@ -279,7 +279,7 @@ def test_skip_existing_goes_by_the_map(shot: list[str], tmp_path: Path, capsys: 
         ("--stmap GIVEN --overscan 4", "covers 96x64 pixels from 0,0 on, expected all of the picture"),
         ("--stmap GIVEN --channels motion", "--stmap: motion is not defined for distorted pictures"),
         ("--stmap WHOLE", "WHOLE: has R, G, B as uint8, expected an STMap's R and G as floats"),
-        ("--distort", "distortion, expected a COLMAP model's folder or a transforms.json"),
+        ("--distort", "XMP files, a COLMAP model's folder or a transforms.json"),
         ("--distort --stereo 0.1", "--stereo and --distort exclude each other"),
         ("--distort --path turntable", "--distort: applies to the photographs' own cameras, expected it without"),
     ],
