@@ -42,8 +42,8 @@ EVERY_SHAPE = pytest.mark.parametrize(
     [pytest.param(index, every := index in DEFAULT, id=f"{label(index)}{'-every' if every else ''}") for index in KEPT],
     indirect=["device"],
 )
-"""Mark of a test that runs all shapes at once. On each driver it has two, since builds take most of the time; the
-default driver has all."""
+"""Mark of a test that runs several shapes at once: all on the default driver, and on other drivers COMMON_SHAPES, since
+builds take most of the time."""
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
