@@ -228,7 +228,7 @@ def _place_of(verb: ConvertVerb, source: Path) -> Georeference | None:
 
 
 def _keep_place(verb: ConvertVerb, place: Georeference | None, matrix: Float64 | None) -> None:
-    """Write the target's place on the earth. The place of a file that was replaced is removed.
+    """Write the target's place on the earth. Without a place, remove the record of a model that was replaced.
 
     place: the source's place. matrix: (4, 4), the transform of the edits; None if they do not transform the model.
     """

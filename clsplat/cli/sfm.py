@@ -30,7 +30,7 @@ class SfmVerb(Verb):
     """Folder for the scene. The frames of videos are written to a folder beside it, NAME_frames."""
     frames: OptionalInt = None
     """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: frames
-    that were taken before, of any number, else by length and motion, at most 300."""
+    that were taken before are used, of any number; otherwise length and motion decide, at most 300."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
     """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed."""
     features: Literal["sift", "aliked"] = "sift"

@@ -47,7 +47,7 @@ class TrainVerb(Verb):
     RealityScan, or just photos, videos or both; or a video. Not needed with --resume."""
     frames: OptionalInt = None
     """Number of frames to take from each video, as with clsplat sfm --frames. If not given: frames that were taken
-    before, of any number, else a number by length and motion."""
+    before are used, of any number; otherwise length and motion decide."""
     resume: Flag = False
     """Continue the run in the output folder."""
     accept_changes: Flag = False
@@ -318,7 +318,7 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
 
     source: the scene's folder, or a video.
     earlier: the run to continue; None for a new run.
-    frames: number of frames of each video; None for frames that were taken before, or a number by the video.
+    frames: number of frames to take from each video, as for `load_scene`.
     """
     from clsplat.training.preparation import prepared
 

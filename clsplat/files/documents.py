@@ -21,7 +21,10 @@ much memory."""
 MAX_PARSED_BYTES = 1 << 30
 """Most memory in bytes that a file of more than MAX_DOCUMENT_BYTES may take, by `parsed_bytes`."""
 _OBJECT_BYTES = {b"[": 72, b"{": 256, b",": 48, b'"': 32}
-"""Most bytes that Python needs for a list, a dict, a value after a comma, and half a text, keyed by their signs."""
+"""Most bytes of the Python object that a sign of JSON stands for: a list, a dict, a value after a comma, half a string.
+
+A string has two quotes.
+"""
 MAX_SETTINGS_BYTES = 1 << 20
 """Size limit of a run's config.toml in bytes."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"

@@ -164,7 +164,7 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
 
 def stored_size(path: Path, source: Any) -> tuple[int, int]:
-    """Return width and height of an open image before its EXIF orientation is applied; of an EXR's display window.
+    """Return width and height of an open image before its EXIF orientation is applied; for EXR, of the display window.
 
     source: as from `open_image`. Raises InputError for a truncated PNG.
     """
@@ -266,7 +266,7 @@ def alpha_of(spec: Any) -> int:
 
 
 def open_photograph(path: Path) -> Any:
-    """Open a picture of any kind, as from a camera, like `open_image`.
+    """Open a picture like `open_image`, also in formats that only cameras write.
 
     HEIF, AVIF and raw photographs, which OpenImageIO does not decode, give a `DecodedPhoto` with the same methods.
     Photographs with an ICC profile of Display P3 or Adobe RGB give an `SrgbPhoto`, which converts their colours.

@@ -140,7 +140,7 @@ class Run:
         return other in (own, reconstruction_folder(own))
 
     def frame_for(self, path: Path) -> FrameUse | SceneFrame:
-        """Return the frame in which a scene or its cameras fit the model: of the run's own scene, the model's frame.
+        """Return the frame in which a scene or its cameras fit the model: the model's frame for the run's own scene.
 
         The scene's files may have been turned since the training. Other scenes keep the frame of their files. Raises
         InputError for a damaged frame.json.

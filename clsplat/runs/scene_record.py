@@ -139,8 +139,8 @@ def own_cameras(run: Run | None) -> list[Camera]:
 def differences(earlier: dict[str, Any], now: dict[str, Any], *, moved: bool = False) -> list[str]:
     """Return short descriptions of the differences between two records of a run's scene: the earlier one and now.
 
-    moved: True if the scene was moved from the frame of its files. The files may have been turned or scaled since, so
-        that the same points are rounded otherwise. Then only the number of points is compared.
+    moved: True if the scene was moved from the frame of its files. The files may have been turned or scaled since the
+        earlier record, so that the same points are rounded differently. So only the number of points is compared.
     If --resolution has changed, two differences are left out: changed sizes, and changed pixels of a photograph that is
     now read from another file.
     """

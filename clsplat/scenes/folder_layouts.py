@@ -126,13 +126,14 @@ def _add_pictures(data: DataSet, folder: Path, listed_in: Path, missing: Missing
     folder: the folder with the pictures.
     listed_in: the file or folder with the cameras, for messages.
     missing: how many pictures may be missing, as for `find_pictures`.
-    labels: True if names without an extension are usual, so that they need no warning.
+    labels: True if names may lack the extension, as Metashape's labels do. Then a file with any extension is taken
+        without a warning.
     """
     present = find_images(folder)
     if not present:
         raise InputError(f"{folder}: no images found, expected the {len(data.images)} images of {listed_in}")
     listed = [image.name for image in data.images]
-    # Of two files such as IMG.jpg and IMG.png, which is a mask, the first one in alphabetical order counts.
+    # Of IMG.jpg and IMG.png the first one in alphabetical order is the photograph: the PNG may be a mask.
     by_label = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(present)}
     labelled = by_label if labels else {}
     exact = [labelled.get(name, folder / name) for name in listed]

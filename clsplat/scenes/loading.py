@@ -82,8 +82,8 @@ def load_scene(
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing: "few" (a tenth), "skip" (all but one) or "error" (none).
     frame: a change of the files' frame, such as `FrameUse("up")`, or the frame of an earlier run, which the scene gets.
-    frames: number of frames to take from each video. None uses frames that were taken before, of any number, and else
-        chooses the number by the video's length and motion.
+    frames: number of frames to take from each video. None uses frames that were taken before, of any number. If
+        there are none, the video's length and motion decide the number.
 
     A folder of photographs or videos, and a video, goes through `clsplat.scenes.sfm.reconstruct` first. An earlier
     result for the same photographs is reused.
@@ -142,7 +142,7 @@ def load_scene_of(
 
 
 def _check_kind(path: Path, kind: Kind, images: str | Path | None, frames: int | None) -> None:
-    """Raise InputError for arguments of `load_scene` that the layout `kind` does not have."""
+    """Raise InputError for arguments of `load_scene` that do not apply to the layout `kind`."""
     if frames is not None and kind != "photos":
         raise InputError(f"--frames {frames}: {path} is a scene with cameras, expected a video or a folder with videos")
     if images is not None and kind == "photos":

@@ -89,7 +89,7 @@ def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
         ("[]", "is not a JSON object, expected one with 'epsg'"),
         ("{}", "has no 'epsg', expected the number of an EPSG code"),
         ('{"epsg": "32632"}', "'epsg' is 32632, expected"),
-        ('{"epsg": 4326}', "EPSG:4326 counts in degrees, expected a coordinate reference system in metres"),
+        ('{"epsg": 4326}', "EPSG:4326 is a code .* in degrees; expected a coordinate reference system in metres"),
         ('{"epsg": 32632, "origin": [1, 2]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "origin": [1, 2, NaN]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "transform": [[1,0,0],[0,1,0],[0,0,2]]}', "'transform' is .*, expected a rotation times a"),

@@ -152,7 +152,7 @@ def test_an_output_that_must_not_be_replaced_is_refused_before_videos_are_decode
 def test_too_few_frames_say_where_they_are(video: Path, tmp_path: Path, tasks: list[dict[str, Any]]) -> None:
     """Frames that were taken with a small --frames are used again without it, so that the message says how to go on."""
     refuses("only 2 photo", sfm.reconstruct, video, tmp_path / "scene", frames=2)
-    told = r"only 2 photo\(s\) found, with 2 frame.*at least 3; remove the frames in .*scene_frames, and give a larger"
+    told = r"2 photo\(s\) found, 2 of them from .*at least 3; remove the frames in .*scene_frames, and give a larger"
     refuses(told, sfm.reconstruct, video, tmp_path / "scene")
     shutil.rmtree(tmp_path / "scene_frames")
     sfm.reconstruct(video, tmp_path / "scene")

@@ -34,8 +34,8 @@ DRIVER = min(
 )
 """Index of the device whose driver misbehaves.
 
-It is one whose driver has a cache, if there is one, the default one before others. With another driver, every
-process would build all kernels again.
+It is a device whose driver has a cache, if there is one, and the default device if that has. With another driver,
+every process would build all kernels again.
 """
 
 

@@ -69,7 +69,7 @@ def leave_out(config: pytest.Config, items: list[pytest.Item], driver_of: Callab
 
 
 def _of_all(item: pytest.Item) -> bool:
-    """Whether a test names one of OF_ALL_DRIVERS, itself or through what its module defines and it names."""
+    """True if a test names one of OF_ALL_DRIVERS, directly or through other names that its module defines."""
     if not isinstance(item, pytest.Function):
         return True
     names, waiting = _names(item.path), [item.originalname]

@@ -42,8 +42,8 @@ EVERY_SHAPE = pytest.mark.parametrize(
     [pytest.param(index, every := index in DEFAULT, id=f"{label(index)}{'-every' if every else ''}") for index in KEPT],
     indirect=["device"],
 )
-"""Mark of a test that runs all shapes at once. On each driver it has two, since builds take most of the time; the
-default driver has all."""
+"""Mark of a test that runs several shapes at once: all on the default driver, and on other drivers COMMON_SHAPES, since
+builds take most of the time."""
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
@@ -59,8 +59,8 @@ def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tup
 def has_slow_parameters(index: int, shape: tuple[Any, ...] | None) -> bool:
     """Whether slow parameters of a test run on a driver, in a shape; None: in its own.
 
-    Only the default driver has them, in COMMON_SHAPES: each pair of a parameter and a driver, or of a
-    parameter and a shape, builds kernels of its own, which takes nine tenths of such a test's time.
+    Only the default driver has them, in COMMON_SHAPES. Each parameter builds its own kernels on each driver and in each
+    shape, which takes nine tenths of such a test's time.
     """
     return index in DEFAULT and shape in {None, *COMMON_SHAPES}
 

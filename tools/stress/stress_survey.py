@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 
 def reading(folder: Path) -> dict[str, Any]:
-    """Read the scene in a folder. Returns the times and peaks of the steps, and what the scene has."""
+    """Read the scene in a folder. Returns the times and peaks of the steps, and the scene's counts and warnings."""
     rows: dict[str, Any] = {}
     if (model := colmap.find_model(folder)) is not None:
         rows["digest"] = digest_of(measured(rows, "read", lambda: colmap.read_model(model)))

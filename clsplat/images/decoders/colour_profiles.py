@@ -2,7 +2,7 @@
 """Conversion of photographs with an ICC profile of Display P3 or Adobe RGB to sRGB, where they are decoded (`in_srgb`).
 
 LittleCMS, in Pillow, tells which space a profile describes, and converts pixels of 8 bits. OpenImageIO converts pixels
-with more bits, which Pillow does not have.
+with more bits, which Pillow does not have, and pixels with premultiplied alpha.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ from clsplat.images.decoders.decoded_photo import ICC_PROFILE_ATTRIBUTE
 ADOBE_RGB_GAMMA = 563 / 256
 """Exponent of the curve of Adobe RGB (1998)."""
 MAX_SAME_SPACE_LEVELS = 2.0
-"""Largest difference in 255ths between colours that LittleCMS converts by a profile, and by the space that the profile
-describes. Two roundings to 8 bits account for 1, and the precision of curves in profiles for the rest."""
+"""Largest difference in 255ths of LittleCMS's conversion by a profile from a `WideSpace`'s conversion.
+
+With a larger one the profile describes another space. Two roundings to 8 bits account for 1, and the precision of
+curves in profiles for the rest.
+"""
 _BUILT_IN_CONFIG = "ocio://default"
 """OpenImageIO's name of the OpenColorIO configuration, which does not depend on the user's variable OCIO."""
 
@@ -35,8 +38,8 @@ _BUILT_IN_CONFIG = "ocio://default"
 class WideSpace:
     """A colour space with a larger gamut than sRGB.
 
-    linear: OpenColorIO's name of the space with its primaries and linear values.
-    to_linear: its curve.
+    linear: OpenColorIO's name of the linear space with the same primaries.
+    to_linear: function from stored values to linear ones.
     """
 
     linear: str
@@ -64,7 +67,7 @@ ADOBE_RGB = WideSpace("Linear AdobeRGB", _adobe_to_linear)
 
 
 class SrgbPhoto:
-    """A photograph in another space, with sRGB pixels, and those methods of OpenImageIO's ImageInput that are used."""
+    """A photograph in a `WideSpace` whose pixels are read as sRGB, with the methods of OpenImageIO's ImageInput."""
 
     def __init__(self, source: Any, space: WideSpace, profile: bytes) -> None:
         """Wrap an open photograph of unsigned integers with 3 or 4 channels.
@@ -120,7 +123,7 @@ class SrgbPhoto:
 def in_srgb(source: Any) -> Any:
     """Return an open image whose pixels are in sRGB: an `SrgbPhoto` if its ICC profile is that of a `WideSpace`.
 
-    Other images are returned as they are: without a profile, with one of sRGB or of another space, grey, and floats.
+    Other images are returned unchanged: without a profile, with a profile of another space, grey, or of floats.
     """
     spec = source.spec()
     profile = spec.getattribute(ICC_PROFILE_ATTRIBUTE)

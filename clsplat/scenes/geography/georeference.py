@@ -2,7 +2,7 @@
 """georeference.json, the record of where a scene lies on the earth: a coordinate reference system and a similarity.
 
 The file applies to the coordinates of the files that it lies beside: the cameras of a scene, where users may write it,
-or the model of a run. Beside a model file NAME.splat or the like it is NAME.georeference.json.
+or the model of a run. The record of a model file such as NAME.splat is NAME.georeference.json.
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ GEOCENTRIC_EPSG = 4978
 GEOCENTRIC_EPSG_CODES = (GEOCENTRIC_EPSG, 4936)
 """Codes of geocentric systems among GEOGRAPHIC_EPSG_CODES. Their coordinates are metres."""
 GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
-"""EPSG codes whose coordinates are latitude and longitude in degrees, except for GEOCENTRIC_EPSG_CODES."""
+"""EPSG codes that are refused except for GEOCENTRIC_EPSG_CODES, as most of them count in degrees.
+
+A few projected systems are among them, such as 4647, and are refused too.
+"""
 MAX_EPSG_CODE = 1_000_000
-"""Limit of EPSG codes."""
+"""EPSG codes are less than this number."""
 SIMILARITY_SLACK = 1e-6
 """Largest relative deviation of a transform from a rotation times a scale. Numbers with 7 digits deviate by less."""
 DOUBTED_MEDIANS, MIN_DOUBTED_METRES = 6.0, 30.0
-"""GPS positions are not used if they are farther from their cameras than the first number times the median distance,
-and than the second number of metres."""
+"""A GPS position is not used if its distance from its camera is over DOUBTED_MEDIANS times the median distance and over
+MIN_DOUBTED_METRES."""
 _EXPECTED_GEOREFERENCE = "the record of where a scene lies on the earth"
 
 
@@ -53,9 +56,10 @@ class GpsResiduals:
 
     @classmethod
     def of(cls, where: object, distances: Mapping[str, float]) -> GpsResiduals | None:
-        """Summarise distances in metres by the photographs' names, without positions that are far off; None for none.
+        """Summarise distances in metres, by the photographs' names. Leaves out positions that are far off.
 
         where: the file, for the warning that names photographs whose position is far off.
+        Returns None if there are no distances.
         """
         if not distances:
             return None
@@ -183,8 +187,9 @@ def _epsg(path: Path, code: Any) -> int:
         raise InputError(f"{path}: {found}, expected the number of an EPSG code, such as 32632")
     if code in GEOGRAPHIC_EPSG_CODES and code not in GEOCENTRIC_EPSG_CODES:
         raise InputError(
-            f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "
-            "zone; export the cameras again in such a system"
+            f"{path}: EPSG:{code} is a code from {GEOGRAPHIC_EPSG_CODES[0]} to {GEOGRAPHIC_EPSG_CODES[-1]}, most of "
+            "which count in degrees; expected a coordinate reference system in metres, such as a UTM zone (32632); "
+            "export the cameras again in such a system"
         )
     return code
 

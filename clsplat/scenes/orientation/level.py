@@ -14,8 +14,10 @@ COLMAP_UP = (0.0, -1.0, 0.0)
 """Up axis of a world that has the axes of a level camera, whose y axis points down in COLMAP's convention."""
 
 MIN_RIGHT_SPREAD = 0.05
-"""Minimum mean square of the cameras' x axes along the second of their principal axes, at which they span a plane. It
-is 0.5 for cameras all around."""
+"""Minimum mean square of the cameras' x axes along their second principal axis, from which on the x axes span a plane.
+
+For cameras that look in all directions around it is 0.5.
+"""
 
 
 def up_axis(cameras: Sequence[Camera]) -> Float64:
@@ -38,7 +40,8 @@ def up_axis(cameras: Sequence[Camera]) -> Float64:
 def median_roll(cameras: Sequence[Camera]) -> float | None:
     """Return the median angle of the cameras' x axes from level in radians, for up as from `up_axis`.
 
-    Returns None if all photographs are from one side, so that their tilts up and down decide up, too.
+    Returns None if the x axes span no plane, as of photographs from one side. Their up direction also depends on how
+    far the cameras are tilted up or down.
     """
     right = np.stack([camera.rotation[0] for camera in cameras])
     if np.linalg.eigvalsh(right.T @ right / len(cameras))[1] < MIN_RIGHT_SPREAD:

@@ -137,7 +137,7 @@ def new_frame(
 def _to_metres(unit: float, rule: ScaleRule, frame: SceneFrame) -> tuple[float, SceneFrame]:
     """Return the factor that brings a frame's units to metres, and the frame with the two points of the rule.
 
-    Points that are given a second time were measured before the scene was scaled, so the factor is for that scale.
+    The same two points given again were measured before the scene was scaled, so `unit` is for the scale at that time.
 
     unit: length in metres of the unit in which the rule's points or cameras were measured.
     """

@@ -47,9 +47,9 @@ GREY_LEVELS = ["128", "128", "128"]
 ImageRow = tuple[int, str, int, tuple[float, ...]]
 """An image: its id, name and camera's id, and its pose: QW QX QY QZ TX TY TZ."""
 PointBlock = tuple[Float64, NDArray[Any]]
-"""Some points: positions (k, 3), and colours (k, 3) from 0 to 255, as uint8 if they are such numbers."""
+"""Some points: positions (k, 3), and colours (k, 3) as in the file: uint8 if that holds them all, else float64."""
 TrackBlock = tuple[Float64, Float64, NDArray[np.int64], NDArray[np.int64]]
-"""Some points: positions (k, 3), reprojection errors (k,), lengths (k,) of the tracks, and image ids of all tracks."""
+"""Some points: positions (k, 3), reprojection errors (k,), lengths (k,) of tracks, image ids of all observations."""
 
 
 class Records:
@@ -107,7 +107,7 @@ class Records:
 
 @contextmanager
 def _opened(path: Path, what: str, least: int) -> Iterator[tuple[Records, int]]:
-    """Context manager that opens a binary file and yields a reader behind the header, and the number of records.
+    """Context manager that opens a binary file and yields a reader after the header, and the number of records.
 
     what, least: as for `records`.
     At the end, raises InputError if bytes follow the last record.

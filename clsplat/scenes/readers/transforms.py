@@ -46,7 +46,7 @@ NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 LAST_ROW_TOLERANCE = 1e-6
 """Maximum deviation of a pose's last row from 0 0 0 1. Products of float32 matrices deviate by less."""
 MAX_TRANSFORMS_BYTES = 512 << 20
-"""Largest size of a transforms.json in bytes. A frame takes about 1 KB, and 3 KB of memory, which has its own limit."""
+"""Largest size of a transforms.json in bytes. A frame takes about 1 KB, and 3 KB of memory (MAX_PARSED_BYTES)."""
 FOCAL_ANGLE_TOLERANCE = 0.02
 """Relative tolerance between a focal length and the angle of view in the same file.
 

@@ -45,8 +45,10 @@ SFM_MAPPERS: tuple[str, ...] = get_args(Mapper)
 SFM_FEATURES: tuple[str, ...] = get_args(Features)
 """Choices of `SfmSettings.features`."""
 MAX_SFM_FEATURES, EARLIER_MAX_SFM_FEATURES = 4096, 8192
-"""Maximum number of features in a photograph by default, in this version and in those before it. The time of matching a
-pair grows with its square."""
+"""Default maximum number of features in a photograph: in this version, and in those before it.
+
+The time of matching a pair of photographs grows faster than their number of features.
+"""
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,8 @@ class SfmSettings:
     def __str__(self) -> str:
         """Return the values of the settings in one line, for the fingerprint of a result.
 
-        Mapper and features are left out by default, so that results of versions without these choices are reused. The
-        default number of features is that of these versions, and another number is marked.
+        Mapper and features are left out by default, so that results of versions without these choices are reused. For
+        the same reason the default number of features is written as EARLIER_MAX_SFM_FEATURES, and any other after "=".
         """
         lens = f"{self.camera_model} {self.shared_camera}"
         chosen = (self.mapper, self.features)
@@ -143,8 +145,9 @@ def reconstruct(
     Warns of copies, of which one is used, of photographs without a pose, in an unreadable format or without their
     alpha, and of focal lengths that differ from EXIF's. Raises InputError for a folder without photographs, a
     photograph that does not decode, an output that must not be replaced, and if the cameras cannot be recovered.
-    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for all frames of videos. If
-    earlier frames are to be replaced, they and an earlier result stay whole until the new result is complete.
+    Raises ClsplatError if pycolmap fails. After KeyboardInterrupt no files remain, except for the frames of videos if
+    all of them were written. If earlier frames are to be replaced, they and an earlier result stay whole until the new
+    result is complete.
     """
     report = progress or no_progress
     settings.check()
@@ -353,10 +356,11 @@ def _require_enough(images: Path, count: int, videos: VideoFrames) -> None:
     if count < MIN_SFM_PHOTOS:
         found, again = "photo(s) found", ""
         if videos.paths:
-            found += f", with {len(videos.paths)} frame(s) of videos"
-            again = "; give a larger --frames or none"
+            found += f", {len(videos.paths)} of them from videos"
+            again = "give a larger number with --frames, or leave --frames out"
             if videos.made is None:  # the frames stay, and would be used again
-                again = f"; remove the frames in {videos.folder}, and give a larger --frames or none"
+                again = f"remove the frames in {videos.folder}, and {again}"
+            again = f"; {again}"
         raise InputError(f"{images}: only {count} {found}, expected at least {MIN_SFM_PHOTOS}{again}")
 
 

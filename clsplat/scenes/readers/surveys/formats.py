@@ -27,8 +27,10 @@ from clsplat.scenes.readers.surveys.realityscan import XMP_FILES, find_xmp, read
 MIN_SPREAD_DEGREES, MAX_SPREAD_DEGREES = 1e-5, 0.5
 """Least and largest extent, along x and y, of positions that may be degrees of longitude and latitude."""
 MIN_HEIGHT_PER_DEGREE = 300.0
-"""Smallest ratio of the extents along z and in x and y of positions that count as metres over degrees. For a flight
-with a kilometre to each metre of height it is 111."""
+"""Ratio of the extent in z to the larger one in x and y, above which positions count as metres over degrees.
+
+A flight of 1 km whose heights differ by 1 m has a ratio of 111 in degrees.
+"""
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,8 @@ class SurveyFormat:
     name: the file in words, for messages.
     find: function that returns the path of the file in a scene's folder; None if there is none.
     is_one: function that returns True for a file of this format.
-    read: function of the file, and of the folder of photographs that the user gave or None, which reads the file. The
-        images have no paths.
+    read: function that reads the file. Its second argument is the folder of photographs that the user gave, or None.
+        The images have no paths.
     is_folder: True if the cameras are in files beside the photographs.
     """
 

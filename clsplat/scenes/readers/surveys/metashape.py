@@ -5,9 +5,9 @@ Lenses: Agisoft Metashape User Manual, Professional Edition, appendix "Camera mo
 middle, b1 is added to the focal length along x, and p1 and p2 are in the reverse of OpenCV's order. The layout of the
 file has no specification; it is that of versions 1.5 to 2.2.
 
-A camera's `transform` is `chunk_from_camera` in our axes. The `transform` of its component, or of the chunk, takes that
-to geocentric coordinates, or to the local system if the chunk has one. Geocentric cameras are brought to the plane that
-touches the ellipsoid near the cameras' middle: x east, y north, z up.
+A camera's `transform` is `chunk_from_camera` in our axes. The `transform` of the camera's component, or else of the
+chunk, goes from the chunk's coordinates to geocentric ones, or to the chunk's local system if it has one. Geocentric
+cameras are moved to the plane that touches the ellipsoid near the cameras' middle: x east, y north, z up.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def read_metashape(path: Path) -> DataSet:
 
 
 def _aligned(chunk: Element) -> Iterator[Element]:
-    """Yield the camera elements, of groups too, that have a pose and are not disabled."""
+    """Yield the camera elements that have a pose and are not disabled, also those in groups."""
     for camera in chunk.iterfind("cameras//camera"):
         if camera.find("transform") is not None and camera.get("enabled", "true") not in ("false", "0"):
             yield camera
@@ -197,7 +197,7 @@ class _Sensors:
         """Note a skew, or raise InputError for a large one.
 
         skew: b2, the shift along x in pixels per unit of the coordinate y of the distorted ray.
-        highest: largest coordinate y in the picture.
+        highest: largest coordinate y of a distorted ray in the picture.
         """
         shift = abs(skew) * highest
         if shift > MAX_SKEW_SHIFT_PX:

@@ -30,7 +30,7 @@ OPENSFM_FOLDER = "opensfm"
 REFERENCE_FILE = "reference_lla.json"
 """File next to RECONSTRUCTION_FILE with the place of the world's origin, in older versions."""
 MAX_RECONSTRUCTION_BYTES = 256 << 20
-"""Largest size of a reconstruction.json in bytes. Two million points take about as much."""
+"""Largest size of a reconstruction.json in bytes. MAX_PARSED_BYTES allows about 750,000 points, by their memory."""
 RECONSTRUCTION_HEAD_BYTES = 4096
 """Number of bytes at the beginning of a file by which a reconstruction.json with another name is recognised."""
 NO_GPS_DOP = 1e5

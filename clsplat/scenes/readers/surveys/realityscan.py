@@ -56,26 +56,26 @@ def find_xmp(folder: Path) -> Path | None:
 def read_xmp(folder: Path, photographs: Path | None) -> DataSet:
     """Read the XMP files of a folder. The images have no paths, and there are no points.
 
-    photographs: folder with the photographs, which have the same names; None if they are beside the XMP files.
+    photographs: folder of photographs with the XMP files' names; None if they are beside the XMP files.
     XMP files without a pose are left out: RealityScan has not aligned their photographs. Raises InputError that
-    names the file for invalid XML and values, files of different coordinate systems, unsupported lenses, and XMP files
-    of which no photograph is found.
+    names the file for invalid XML and values, files of different coordinate systems, and unsupported lenses. Also
+    raises it if no XMP file has a photograph.
     """
     cameras = [_Xmp(folder, path) for path in _sidecars(folder) if _has_pose(path)]
     _check_one_system(folder, cameras)
     there = photographs or folder
     present = find_images(there)
     files = {path.relative_to(there).as_posix(): path for path in present}  # IMG.jpg.xmp, then IMG.xmp
-    # Of two files such as IMG.jpg and IMG.png, which is a mask, the first one in alphabetical order counts.
+    # Of IMG.jpg and IMG.png the first one in alphabetical order is the photograph: the PNG may be a mask.
     files |= {path.relative_to(there).with_suffix("").as_posix(): path for path in reversed(present)}
     sizes = {camera.name: image_size(files[camera.name], orient=False) for camera in cameras if camera.name in files}
     if not sizes:
         names = examples(camera.name for camera in cameras)
         raise InputError(
             f"{there}: has no photograph of the {len(cameras):,} XMP files of {folder} ({names}), expected photographs "
-            "with these names beside them; the XMP files may be of another project, else copy them to the photographs"
+            "with these names; copy the XMP files to their photographs, or remove them if they are of another project"
         )
-    # A missing photograph is left out later, or found under another name. It counts as large as most others.
+    # A missing photograph is left out later, or found under another name. Until then it has the most frequent size.
     ((usual, _),) = Counter(sizes.values()).most_common(1)
     return DataSet([camera.image(*sizes.get(camera.name, usual)) for camera in cameras])
 

@@ -92,7 +92,7 @@ def keep_largest(database: Path, most: int) -> None:
     """Delete the smallest features of every photograph that has more than `most`.
 
     pycolmap's own limit leaves out whole scales and counts a feature with two orientations once, so that photographs
-    have up to 80 % more features than it says.
+    have up to 80 % more features than it allows.
     """
     with contextlib.closing(sqlite3.connect(database)) as connection, connection:
         over = connection.execute("SELECT image_id FROM keypoints WHERE rows > ?", (most,)).fetchall()
@@ -158,7 +158,7 @@ def _array(connection: sqlite3.Connection, table: str, image: int, dtype: np.dty
 
 
 def _largest_first(points: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the indices of keypoints (K, columns) by size, the largest first. Of equal ones, the first is first."""
+    """Return the indices of keypoints (K, columns) by size, the largest first. Equal sizes keep their order."""
     # A keypoint has x, y and the affine shape (4 values), or x, y, scale and orientation, or x and y.
     sizes = np.abs(points[:, 2]) if points.shape[1] > 2 else np.zeros(len(points))
     if points.shape[1] == 6:
