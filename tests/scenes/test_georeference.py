@@ -61,17 +61,18 @@ def test_the_tangent_plane_at_a_place() -> None:
     np.testing.assert_allclose(place_of(geocentric_of(place)), place, atol=1e-6)
 
 
-def test_a_record_comes_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("code", [32632, 4647, 4978])  # UTM zone 32N, the same with its number before x, geocentric
+def test_a_record_comes_back(tmp_path: Path, code: int) -> None:
     path = tmp_path / GEOREFERENCE_FILE
     assert read_georeference(path) is None
     change = similarity()
-    wanted = Georeference(32632, survey_files.UTM_OFFSET, change[:3, :3], GpsResiduals(3, 0.5, 0.75), "from here")
+    wanted = Georeference(code, survey_files.UTM_OFFSET, change[:3, :3], GpsResiduals(3, 0.5, 0.75), "from here")
     path.write_bytes(wanted.content())
     found = read_georeference(path)
     assert found is not None
     np.testing.assert_array_equal(found.origin, wanted.origin)
     np.testing.assert_array_equal(found.transform, wanted.transform)
-    assert (found.epsg, found.residuals, found.note) == (32632, wanted.residuals, "from here")
+    assert (found.epsg, found.residuals, found.note) == (code, wanted.residuals, "from here")
 
 
 def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
@@ -89,7 +90,7 @@ def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
         ("[]", "is not a JSON object, expected one with 'epsg'"),
         ("{}", "has no 'epsg', expected the number of an EPSG code"),
         ('{"epsg": "32632"}', "'epsg' is 32632, expected"),
-        ('{"epsg": 4326}', "EPSG:4326 is a code .* in degrees; expected a coordinate reference system in metres"),
+        ('{"epsg": 4326}', "EPSG:4326 counts in degrees, expected a coordinate reference system in metres"),
         ('{"epsg": 32632, "origin": [1, 2]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "origin": [1, 2, NaN]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "transform": [[1,0,0],[0,1,0],[0,0,2]]}', "'transform' is .*, expected a rotation times a"),

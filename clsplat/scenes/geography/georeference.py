@@ -25,13 +25,11 @@ MAX_GEOREFERENCE_BYTES = 1 << 20
 """Size limit of georeference.json in bytes."""
 GEOCENTRIC_EPSG = 4978
 """EPSG code of WGS 84 geocentric coordinates (x, y, z in metres from the earth's centre)."""
-GEOCENTRIC_EPSG_CODES = (GEOCENTRIC_EPSG, 4936)
-"""Codes of geocentric systems among GEOGRAPHIC_EPSG_CODES. Their coordinates are metres."""
-GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
-"""EPSG codes that are refused except for GEOCENTRIC_EPSG_CODES, as most of them count in degrees.
-
-A few projected systems are among them, such as 4647, and are refused too.
-"""
+GEOGRAPHIC_EPSG_CODES = frozenset(
+    {4148, 4167, 4171, 4230, 4258, 4267, 4269, 4277, 4283, 4284, 4289, 4301, 4312, 4314, 4322, 4326, 4480, 4490, 4612}
+    | {4617, 4619, 4674, 4737, 4937, 4979, 6318, 6668, 7844}
+)
+"""EPSG codes of widely used systems in degrees: WGS 84, ETRS89, NAD83, GDA2020 and other countries' systems."""
 MAX_EPSG_CODE = 1_000_000
 """EPSG codes are less than this number."""
 SIMILARITY_SLACK = 1e-6
@@ -185,11 +183,10 @@ def _epsg(path: Path, code: Any) -> int:
     if isinstance(code, bool) or not isinstance(code, int) or not 0 < code < MAX_EPSG_CODE:
         found = "has no 'epsg'" if code is None else f"'epsg' is {str(code)[:60]}"
         raise InputError(f"{path}: {found}, expected the number of an EPSG code, such as 32632")
-    if code in GEOGRAPHIC_EPSG_CODES and code not in GEOCENTRIC_EPSG_CODES:
+    if code in GEOGRAPHIC_EPSG_CODES:
         raise InputError(
-            f"{path}: EPSG:{code} is a code from {GEOGRAPHIC_EPSG_CODES[0]} to {GEOGRAPHIC_EPSG_CODES[-1]}, most of "
-            "which count in degrees; expected a coordinate reference system in metres, such as a UTM zone (32632); "
-            "export the cameras again in such a system"
+            f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "
+            "zone (32632); export the cameras again in such a system"
         )
     return code
 
