@@ -74,6 +74,23 @@ def test_a_record_comes_back(tmp_path: Path) -> None:
     assert (found.epsg, found.residuals, found.note) == (32632, wanted.residuals, "from here")
 
 
+@pytest.mark.parametrize("code", [4491, 4549, 4554, 4647, 4839, 4978, 32632])
+def test_systems_in_metres_are_read_whatever_their_code(tmp_path: Path, code: int) -> None:
+    """The codes of Gauss-Kruger zones of CGCS2000, and of UTM zone 32 of ETRS89, lie among those in degrees."""
+    path = tmp_path / GEOREFERENCE_FILE
+    path.write_text(json.dumps({"epsg": code}))
+    found = read_georeference(path)
+    assert found is not None
+    assert found.epsg == code
+
+
+@pytest.mark.parametrize("code", [4001, 4258, 4326, 4490, 4555, 4979])
+def test_systems_in_degrees_are_refused(tmp_path: Path, code: int) -> None:
+    path = tmp_path / GEOREFERENCE_FILE
+    path.write_text(json.dumps({"epsg": code}))
+    refuses(f"EPSG:{code} counts in degrees", read_georeference, path)
+
+
 def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
     place = Georeference(32632, survey_files.UTM_OFFSET, 2 * np.eye(3))
     points = np.random.default_rng(1).normal(size=(20, 3))

@@ -25,10 +25,15 @@ MAX_GEOREFERENCE_BYTES = 1 << 20
 """Size limit of georeference.json in bytes."""
 GEOCENTRIC_EPSG = 4978
 """EPSG code of WGS 84 geocentric coordinates (x, y, z in metres from the earth's centre)."""
-GEOCENTRIC_EPSG_CODES = (GEOCENTRIC_EPSG, 4936)
-"""Codes of geocentric systems among GEOGRAPHIC_EPSG_CODES. Their coordinates are metres."""
 GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
-"""EPSG codes whose coordinates are latitude and longitude in degrees, except for GEOCENTRIC_EPSG_CODES."""
+"""EPSG codes whose coordinates are latitude and longitude in degrees, except for those of METRIC_EPSG_RANGES."""
+METRIC_EPSG_RANGES = (
+    (4026, 4026), (4037, 4038), (4048, 4051), (4056, 4071), (4082, 4100), (4217, 4217), (4390, 4462), (4467, 4467),
+    (4471, 4471), (4474, 4474), (4484, 4489), (4491, 4554), (4559, 4589), (4647, 4656), (4766, 4800), (4812, 4812),
+    (4822, 4822), (4826, 4880), (4936, 4936), (GEOCENTRIC_EPSG, GEOCENTRIC_EPSG),
+)  # fmt: skip
+"""First and last codes of projected and geocentric systems among GEOGRAPHIC_EPSG_CODES, such as China's Gauss-Kruger
+zones (4491 to 4554) and UTM zone 32 with its number before the easting (4647). From version 11.022 of the data set."""
 MAX_EPSG_CODE = 1_000_000
 """Limit of EPSG codes."""
 SIMILARITY_SLACK = 1e-6
@@ -181,7 +186,8 @@ def _epsg(path: Path, code: Any) -> int:
     if isinstance(code, bool) or not isinstance(code, int) or not 0 < code < MAX_EPSG_CODE:
         found = "has no 'epsg'" if code is None else f"'epsg' is {str(code)[:60]}"
         raise InputError(f"{path}: {found}, expected the number of an EPSG code, such as 32632")
-    if code in GEOGRAPHIC_EPSG_CODES and code not in GEOCENTRIC_EPSG_CODES:
+    is_metric = any(first <= code <= last for first, last in METRIC_EPSG_RANGES)
+    if code in GEOGRAPHIC_EPSG_CODES and not is_metric:
         raise InputError(
             f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "
             "zone; export the cameras again in such a system"
