@@ -132,6 +132,15 @@ def test_a_reference_that_is_not_of_these_cameras_is_not_used(tmp_path: Path) ->
     assert data.georeference is None
 
 
+def test_two_names_of_one_photograph_are_one_line(tmp_path: Path) -> None:
+    """Both names are that of the same file below the folder of photographs."""
+    path = survey_files.write_opensfm(tmp_path, reference_lla={"latitude": 48.0, "longitude": 11.0, "altitude": 500.0})
+    (part,) = json.loads(path.read_text())
+    part["shots"][f"../{ring.NAMES[0]}"] = part["shots"][ring.NAMES[0]]
+    path.write_text(json.dumps([part]))
+    refuses("lists view00.png twice, expected each photograph once", load_scene, tmp_path)
+
+
 def change_shot(part: dict[str, Any], **keys: Any) -> None:
     part["shots"][ring.NAMES[1]].update(keys)
 

@@ -173,8 +173,8 @@ def _georeference(
         return None
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise keys.wrong("latitude" if abs(latitude) > 90 else "longitude", "degrees on the earth")
-    centres = {image.name: -image.rotation.T @ image.translation for image in images}
-    away = float(np.linalg.norm(np.median([*centres.values()], axis=0)))
+    centres = np.stack([-image.rotation.T @ image.translation for image in images])
+    away = float(np.linalg.norm(np.median(centres, axis=0)))
     if away > MAX_PLANE_METRES:
         warn(
             f"{path}: its cameras are {away / 1000:,.0f} km from its reference_lla, expected less than "
@@ -182,8 +182,8 @@ def _georeference(
         )
         return None
     distances = {}
-    for shot, (name, centre) in zip(shots.values(), centres.items(), strict=True):
+    for shot, image, centre in zip(shots.values(), images, centres, strict=True):
         if shot.get("gps_position") is not None and (shot.number("gps_dop") or 0.0) < NO_GPS_DOP:
-            distances[name] = float(np.linalg.norm(shot.vector("gps_position", 3) - centre))
+            distances[image.name] = float(np.linalg.norm(shot.vector("gps_position", 3) - centre))
     note = "reference_lla of reconstruction.json: x east, y north, z up"
     return on_tangent_plane((latitude, longitude, altitude), note, GpsResiduals.of(path, distances))
