@@ -132,6 +132,25 @@ def test_a_reference_that_is_not_of_these_cameras_is_not_used(tmp_path: Path) ->
     assert data.georeference is None
 
 
+def test_odms_cameras_before_its_map_projection_are_read(tmp_path: Path) -> None:
+    """ODM renames OpenSfM's file, and writes cameras in a UTM zone to reconstruction.json. Both have reference_lla."""
+    place = {"latitude": 48.0, "longitude": 11.0, "altitude": 0.0}
+    (tmp_path / "opensfm").mkdir()
+    path = survey_files.write_opensfm(tmp_path, reference_lla=place)
+    topocentric = path.rename(tmp_path / "opensfm" / "reconstruction.topocentric.json")
+    turned = survey_files.at(np.array([5.0, 0, 0]))
+    projected = survey_files.write_opensfm(tmp_path, turned, reference_lla=place).rename(
+        tmp_path / "opensfm" / "reconstruction.json"
+    )
+    for given in (tmp_path, tmp_path / "opensfm", topocentric):
+        scene = load_scene(given)
+        assert scene.georeference is not None
+        np.testing.assert_allclose(scene.views[0].camera.position, ring.centre_of(ring.poses()[0]), atol=1e-9)
+    data = warned("map projection, which reference_lla does not fit", read_reconstruction, projected)
+    assert data.georeference is None
+    np.testing.assert_allclose(data.images[0].translation, turned[0][1], atol=1e-9)
+
+
 def test_two_names_of_one_photograph_are_one_line(tmp_path: Path) -> None:
     """Both names are that of the same file below the folder of photographs."""
     path = survey_files.write_opensfm(tmp_path, reference_lla={"latitude": 48.0, "longitude": 11.0, "altitude": 500.0})

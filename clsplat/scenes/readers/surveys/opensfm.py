@@ -25,6 +25,9 @@ from clsplat.scenes.readers.surveys.names import inner_name
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 """Name of the file in OpenSfM's folder."""
+TOPOCENTRIC_FILE = "reconstruction.topocentric.json"
+"""Name that ODM gives to OpenSfM's RECONSTRUCTION_FILE. ODM then writes a RECONSTRUCTION_FILE with cameras and points
+in a UTM zone, less an offset, and still with `reference_lla`."""
 OPENSFM_FOLDER = "opensfm"
 """Folder of an ODM or WebODM project with RECONSTRUCTION_FILE. The photographs are in images/ next to the folder."""
 REFERENCE_FILE = "reference_lla.json"
@@ -46,8 +49,12 @@ EXPECTED_RECONSTRUCTION = "OpenSfM's or WebODM's reconstruction.json"
 
 
 def find_reconstruction(folder: Path) -> Path | None:
-    """Return the path of reconstruction.json in a folder or its sub-folder opensfm/; None if there is none."""
-    candidates = (folder / RECONSTRUCTION_FILE, folder / OPENSFM_FOLDER / RECONSTRUCTION_FILE)
+    """Return the path of reconstruction.json in a folder or its sub-folder opensfm/; None if there is none.
+
+    ODM's reconstruction.topocentric.json is preferred, as its cameras fit `reference_lla`.
+    """
+    names = (TOPOCENTRIC_FILE, RECONSTRUCTION_FILE)
+    candidates = (parent / name for parent in (folder, folder / OPENSFM_FOLDER) for name in names)
     return next((path for path in candidates if is_file(path)), None)
 
 
@@ -164,6 +171,12 @@ def _georeference(
         except ValueError as error:
             raise InputError(f"{where}: is not JSON: {error}; expected latitude, longitude and altitude") from None
     if place is None:
+        return None
+    if path.name == RECONSTRUCTION_FILE and is_file(path.with_name(TOPOCENTRIC_FILE)):
+        warn(
+            f"{path}: ODM brought its cameras to a map projection, which reference_lla does not fit; for their place "
+            f"on the earth, give the folder or its {TOPOCENTRIC_FILE}"
+        )
         return None
     if not isinstance(place, dict):
         raise InputError(f"{where}: 'reference_lla' is {short(place)}, expected latitude, longitude and altitude")
