@@ -58,12 +58,15 @@ def test_the_lens_follows_opensfms_formula(tmp_path: Path) -> None:
     np.testing.assert_allclose(lens.img_from_cam(np.array([[x, y, z]]))[0], wanted, rtol=1e-12)
 
 
-def test_a_project_of_webodm_is_read_from_its_folder(tmp_path: Path) -> None:
+def test_a_project_of_webodm_is_read_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     survey_files.write_opensfm(tmp_path)
     (tmp_path / "opensfm").mkdir()
     (tmp_path / "reconstruction.json").rename(tmp_path / "opensfm" / "reconstruction.json")
     for path in (tmp_path, tmp_path / "opensfm", tmp_path / "opensfm" / "reconstruction.json"):
         assert len(load_scene(path).views) == ring.COUNT
+    monkeypatch.chdir(tmp_path / "opensfm")  # so that the folder's name is not in the path
+    for name in (".", "reconstruction.json"):
+        assert len(load_scene(name).views) == ring.COUNT
 
 
 def test_the_largest_of_several_reconstructions_is_used(tmp_path: Path) -> None:
