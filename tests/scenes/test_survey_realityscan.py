@@ -91,6 +91,20 @@ def test_xmp_files_named_after_the_whole_file(tmp_path: Path) -> None:
     assert [view.name for view in load_scene(tmp_path).views] == ring.NAMES
 
 
+def test_two_xmp_files_of_one_photograph_are_one_line(tmp_path: Path) -> None:
+    survey_files.write_xmp(tmp_path)
+    (tmp_path / "view03.png.xmp").write_text((tmp_path / "view03.xmp").read_text())
+    refuses("lists view03.png twice, expected each photograph once", load_scene, tmp_path)
+
+
+def test_a_cloud_above_the_photographs_is_not_theirs(tmp_path: Path) -> None:
+    folder = survey_files.write_xmp(tmp_path / "photos")
+    ring.write_cloud(tmp_path / "points3D.ply", *ring.points())
+    assert not len(load_scene(folder).points)
+    (tmp_path / "points3D.ply").rename(folder / "points3D.ply")
+    assert len(load_scene(folder).points) == len(ring.points()[0])
+
+
 def test_a_mask_beside_a_photograph_is_not_the_photograph(tmp_path: Path) -> None:
     names = [f"{name[:-4]}.exr" for name in ring.NAMES]  # a file type that sorts before the masks
     survey_files.write_xmp(tmp_path, names=names)
