@@ -110,6 +110,10 @@ def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
         ('{"epsg": 32632, "origin": [1, 2]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "origin": [1, 2, NaN]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "transform": [[1,0,0],[0,1,0],[0,0,2]]}', "'transform' is .*, expected a rotation times a"),
+        (
+            '{"epsg": 32632, "transform": [[1e200,0,0],[0,1e200,0],[0,0,1e200]]}',
+            "'transform' is .*, expected a rotation",
+        ),
         ('{"epsg": 32632, "transform": [[1,0,0],[0,1,0],[0,0,-1]]}', "'transform' is .*, expected a rotation times a"),
     ],
 )

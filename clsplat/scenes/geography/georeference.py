@@ -38,6 +38,8 @@ MAX_EPSG_CODE = 1_000_000
 """Limit of EPSG codes."""
 SIMILARITY_SLACK = 1e-6
 """Largest relative deviation of a transform from a rotation times a scale. Numbers with 7 digits deviate by less."""
+MAX_TRANSFORM_VALUE = 1e12
+"""Limit of the values of a transform. Squares of much larger values may overflow."""
 DOUBTED_MEDIANS, MIN_DOUBTED_METRES = 6.0, 30.0
 """GPS positions are not used if they are farther from their cameras than the first number times the median distance,
 and than the second number of metres."""
@@ -203,7 +205,7 @@ def _residuals(given: Any) -> GpsResiduals | None:
 
 
 def _is_similarity(axes: Float64) -> bool:
-    if axes.shape != (3, 3) or not np.isfinite(axes).all():
+    if axes.shape != (3, 3) or not (np.abs(axes) < MAX_TRANSFORM_VALUE).all():
         return False
     squares = axes.T @ axes
     size = float(np.trace(squares)) / 3
