@@ -28,6 +28,7 @@ from clsplat.scenes.dataset import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
+from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.readers.colmap import read_model
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.sfm.framing import MODEL_FOLDER, scale_new, set_frame, turn_new
@@ -153,6 +154,29 @@ def test_gps_scales_with_and_without_a_turn(
         assert scene.frame.origin == ()
         turned_by = scene.views[0].camera.rotation.T @ load_scene(folder).views[0].camera.rotation
         np.testing.assert_allclose(turned_by, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("orient", ["up", None])
+def test_the_same_gps_again_changes_nothing(
+    orient: Literal["up"] | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = np.stack([ring.centre_of(pose) for pose in ring.poses()])
+    off = np.random.default_rng(0).normal(
+        size=places.shape
+    )  # errors of a metre, so that the fit is none without residual
+    globe = pycolmap.GPSTransform().enu_to_ellipsoid(10 * places[:, [0, 2, 1]] * (1, 1, -1) + off, -33.0, 151.0, 20.0)
+    positions = {name: GpsPosition(*row) for name, row in zip(ring.NAMES, globe.tolist(), strict=True)}
+    monkeypatch.setattr("clsplat.scenes.orientation.new_frame.gps_of", lambda path: positions[path.name])
+    monkeypatch.setattr("clsplat.scenes.orientation.new_frame.gravity_of", lambda path, upright: None)
+    data = read_model(folder / "sparse" / "0")
+    files = {name: Path(name) for name in ring.NAMES}
+    use = FrameUse(orient, "gps")
+    frame = new_frame("scene", data, files, use, data.frame, turned=True)
+    change = frame.change_from(data.frame)
+    assert change is not None
+    again = in_frame(data, change)
+    for repeated in (use, FrameUse(None, "gps")):
+        assert new_frame("scene", again, files, repeated, frame, turned=True) is frame
 
 
 def test_a_transforms_json_is_turned_too(tmp_path: Path) -> None:
