@@ -14,8 +14,13 @@ import ring
 import survey_files
 from calls import refuses, warned
 
+from clsplat.files.documents import parsed_bytes
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.readers.surveys.opensfm import read_reconstruction
+from clsplat.scenes.readers.surveys.opensfm import (
+    MAX_RECONSTRUCTION_BYTES,
+    MAX_RECONSTRUCTION_MEMORY_BYTES,
+    read_reconstruction,
+)
 
 LENGTH = max(ring.WIDTH, ring.HEIGHT)
 BROWN = {"projection_type": "brown", "focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": -0.02}
@@ -152,6 +157,16 @@ def test_odms_cameras_before_its_map_projection_are_read(tmp_path: Path) -> None
     data = warned("map projection, which reference_lla does not fit", read_reconstruction, projected)
     assert data.georeference is None
     np.testing.assert_allclose(data.images[0].translation, turned[0][1], atol=1e-9)
+
+
+@pytest.mark.parametrize("indent", [None, 4])
+def test_a_million_points_are_within_the_limits(tmp_path: Path, indent: int | None) -> None:
+    """Without indentation, and with that of OpenSfM."""
+    count = 500
+    path = survey_files.write_opensfm(tmp_path, optics=[survey_files.RING] * ring.COUNT, cloud=ring.points(count))
+    data = json.dumps(json.loads(path.read_text()), indent=indent).encode()
+    assert len(data) * 1_000_000 / count < MAX_RECONSTRUCTION_BYTES
+    assert parsed_bytes(data) * 1_000_000 / count < MAX_RECONSTRUCTION_MEMORY_BYTES
 
 
 def test_two_names_of_one_photograph_are_one_line(tmp_path: Path) -> None:

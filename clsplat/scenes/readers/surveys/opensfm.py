@@ -32,8 +32,9 @@ OPENSFM_FOLDER = "opensfm"
 """Folder of an ODM or WebODM project with RECONSTRUCTION_FILE. The photographs are in images/ next to the folder."""
 REFERENCE_FILE = "reference_lla.json"
 """File next to RECONSTRUCTION_FILE with the place of the world's origin, in older versions."""
-MAX_RECONSTRUCTION_BYTES = 256 << 20
-"""Largest size of a reconstruction.json in bytes. Two million points take about as much."""
+MAX_RECONSTRUCTION_BYTES, MAX_RECONSTRUCTION_MEMORY_BYTES = 512 << 20, 2 << 30
+"""Largest size of a reconstruction.json in bytes, and most memory in bytes that it may take (`parsed_bytes`). A million
+points take 130 MB, or 350 MB with OpenSfM's indentation, and by the estimate up to 1.6 GB of memory."""
 RECONSTRUCTION_HEAD_BYTES = 4096
 """Number of bytes at the beginning of a file by which a reconstruction.json with another name is recognised."""
 NO_GPS_DOP = 1e5
@@ -94,7 +95,8 @@ def read_reconstruction(path: Path) -> DataSet:
 def _parts(path: Path) -> list[dict[str, Any]]:
     """Return the file's reconstructions that have photographs."""
     try:
-        document = parse_json(read_document(path, EXPECTED_RECONSTRUCTION, MAX_RECONSTRUCTION_BYTES), once=True)
+        text = read_document(path, EXPECTED_RECONSTRUCTION, MAX_RECONSTRUCTION_BYTES, MAX_RECONSTRUCTION_MEMORY_BYTES)
+        document = parse_json(text, once=True)
     except ValueError as error:
         raise InputError(f"{path}: is not JSON: {error}; expected {EXPECTED_RECONSTRUCTION}") from None
     if not isinstance(document, list) or not all(isinstance(part, dict) for part in document):
