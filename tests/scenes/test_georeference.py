@@ -188,3 +188,14 @@ def test_converted_models_get_it(tmp_path: Path, capsys: Capture) -> None:
     random_gaussians(20, 0).save(plain)
     printed(capsys, ["convert", plain, further, "--overwrite"])
     assert read_of_model(further) is None
+
+
+def test_a_mirrored_model_gets_no_place(tmp_path: Path, capsys: Capture) -> None:
+    """A record with a mirror would be refused when it is read."""
+    source, target = tmp_path / "model.ply", tmp_path / "mirrored.ply"
+    random_gaussians(20, 0).save(source)
+    beside_model(source).write_bytes(Georeference(32632, survey_files.UTM_OFFSET).content())
+    mirror = ",".join(map(str, np.diag([-1, 1, 1, 1]).ravel().tolist()))
+    told = printed(capsys, ["convert", source, target, f"--transform={mirror}"]).err
+    assert "mirrored.ply: gets no mirrored.georeference.json, as the model is mirrored" in told
+    assert read_of_model(target) is None
