@@ -77,6 +77,15 @@ def test_16_bits_stay_16_bits(tmp_path: Path) -> None:
     assert len(np.unique(read[:, :, 0])) == 64
 
 
+def test_a_picture_is_converted_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of one row, of three with a smaller last one, and the whole."""
+    rgb = np.random.default_rng(0).random((10, 6, 3), np.float32)
+    whole = ADOBE_RGB.to_srgb(rgb)
+    for pixels in (1, 18, 60):
+        monkeypatch.setattr("clsplat.images.decoders.colour_profiles.CONVERTED_PIXELS", pixels)
+        np.testing.assert_allclose(ADOBE_RGB.to_srgb(rgb), whole, rtol=0, atol=1e-6)  # rounding of float32
+
+
 def test_profiles_of_other_spaces_change_nothing(tmp_path: Path) -> None:
     known = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     for icc in (known, profile(REC709, SRGB_CURVE), profile(ROMM, (1.8,)), b"no profile", known[:200]):

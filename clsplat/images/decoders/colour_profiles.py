@@ -27,6 +27,8 @@ ADOBE_RGB_GAMMA = 563 / 256
 MAX_SAME_SPACE_LEVELS = 2.0
 """Largest difference in 255ths between colours that LittleCMS converts by a profile, and by the space that the profile
 describes. Two roundings to 8 bits account for 1, and the precision of curves in profiles for the rest."""
+CONVERTED_PIXELS = 1 << 20
+"""Number of pixels that OpenImageIO converts at once. A conversion takes seven times the memory of its pixels."""
 _BUILT_IN_CONFIG = "ocio://default"
 """OpenImageIO's name of the OpenColorIO configuration, which does not depend on the user's variable OCIO."""
 
@@ -44,6 +46,12 @@ class WideSpace:
 
     def to_srgb(self, rgb: Float32) -> Float32:
         """Convert colours (H, W, 3) from 0 to 1. Colours that sRGB does not have are clipped to 0 and 1."""
+        srgb, rows = np.empty(rgb.shape, np.float32), max(1, CONVERTED_PIXELS // rgb.shape[1])
+        for first in range(0, len(rgb), rows):
+            srgb[first : first + rows] = self._rows_to_srgb(rgb[first : first + rows])
+        return srgb
+
+    def _rows_to_srgb(self, rgb: Float32) -> Float32:
         source = oiio.ImageBuf(np.ascontiguousarray(self.to_linear(rgb), np.float32))
         made = oiio.ImageBufAlgo.colorconvert(
             source, self.linear, "Linear Rec.709 (sRGB)", colorconfig=_BUILT_IN_CONFIG
