@@ -265,6 +265,12 @@ def test_points_measured_before_the_scene_was_scaled(result: Path) -> None:
             np.testing.assert_allclose(load_scene(result).points, factor * before, atol=1e-12)
 
 
+def test_the_same_points_in_the_other_order_are_the_same(result: Path) -> None:
+    first = set_frame(result, result / "images", FrameUse(None, "0,0,0,0.5,0,0=2"), result)
+    again = set_frame(result, result / "images", FrameUse(None, "0.5,0,0,0,0,0=2"), result)
+    np.testing.assert_array_equal(again.world_from_source, first.world_from_source)
+
+
 def test_a_run_keeps_its_frame_when_the_scene_gets_another(result: Path) -> None:
     set_frame(result, result / "images", UP, result)
     trained = load_scene(result)

@@ -152,7 +152,8 @@ def _to_metres(unit: float, rule: ScaleRule, frame: SceneFrame) -> tuple[float, 
     unit: length in metres of the unit in which the rule's points or cameras were measured.
     """
     now = decompose(frame.world_from_source)[0]
-    then = frame.measured[6] if rule.kind == "points" and frame.measured[:6] == rule.ends else now
+    either_way = (rule.ends, rule.ends[3:] + rule.ends[:3])
+    then = frame.measured[6] if rule.kind == "points" and frame.measured[:6] in either_way else now
     factor = unit * then / now
     if rule.kind == "points":
         frame = replace(frame, measured=(*rule.ends, then))
