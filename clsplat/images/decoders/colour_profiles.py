@@ -27,6 +27,9 @@ ADOBE_RGB_GAMMA = 563 / 256
 MAX_SAME_SPACE_LEVELS = 2.0
 """Largest difference in 255ths between colours that LittleCMS converts by a profile, and by the space that the profile
 describes. Two roundings to 8 bits account for 1, and the precision of curves in profiles for the rest."""
+MAX_PROFILE_BYTES = 1 << 20
+"""Largest size in bytes of an ICC profile that is read. Display P3 and Adobe RGB take up to 4 KB, and `space_of` keeps
+64 profiles in memory."""
 CONVERTED_PIXELS = 1 << 20
 """Number of pixels that OpenImageIO converts at once. A conversion takes seven times the memory of its pixels."""
 _BUILT_IN_CONFIG = "ocio://default"
@@ -128,14 +131,15 @@ class SrgbPhoto:
 def in_srgb(source: Any) -> Any:
     """Return an open image whose pixels are in sRGB: an `SrgbPhoto` if its ICC profile is that of a `WideSpace`.
 
-    Other images are returned as they are: without a profile, with one of sRGB or of another space, grey, and floats.
+    Other images are returned as they are: without a profile, with one of sRGB or of another space, with one of more
+    than MAX_PROFILE_BYTES, grey, and floats.
     """
     spec = source.spec()
     profile = spec.getattribute(ICC_PROFILE_ATTRIBUTE)
     if profile is None or spec.nchannels not in (3, 4) or not str(spec.format).startswith("uint"):
         return source
     content = np.asarray(profile, np.uint8).tobytes()
-    space = space_of(content)
+    space = space_of(content) if len(content) <= MAX_PROFILE_BYTES else None
     return source if space is None else SrgbPhoto(source, space, content)
 
 
