@@ -169,7 +169,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     for companion in target_format.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
     options = _of_format(verb, target_format)
-    place = _place_of(verb, source)
+    place = _place_of(verb, source, matrix)
     original, space = load(source, activated=verb.activated), colour_space(source)
     edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
     if not target_format.floats:
@@ -214,16 +214,24 @@ def run(verb: ConvertVerb, services: Services) -> int:
     return 0
 
 
-def _place_of(verb: ConvertVerb, source: Path) -> Georeference | None:
+def _place_of(verb: ConvertVerb, source: Path, matrix: Float64 | None) -> Georeference | None:
     """Return the place on the earth of the model file `source`; None if it is unknown.
 
+    matrix: as for `_keep_place`. A mirrored model gets no place, with a warning, as records have rotations alone.
     Raises InputError if the target's record of its place may not be written.
     """
+    import numpy as np
+
     from clsplat.scenes.geography.georeference import beside_model, read_of_model
 
     place = read_of_model(source)
-    if place is not None:
-        check_new(beside_model(verb.target), overwrite=verb.overwrite)
+    if place is None:
+        return None
+    if matrix is not None and np.linalg.det(matrix[:3, :3]) < 0:
+        name = beside_model(verb.target).name
+        warn(f"{verb.target}: gets no {name}, as the model is mirrored; convert it without the mirror")
+        return None
+    check_new(beside_model(verb.target), overwrite=verb.overwrite)
     return place
 
 

@@ -19,7 +19,8 @@ MAX_DOCUMENT_BYTES = 32 << 20
 """Largest size of a JSON or TOML file in bytes, unless a reader allows more. The parsed file takes up to 32 times as
 much memory."""
 MAX_PARSED_BYTES = 1 << 30
-"""Most memory in bytes that a file of more than MAX_DOCUMENT_BYTES may take, by `parsed_bytes`."""
+"""Most memory in bytes that a file of more than MAX_DOCUMENT_BYTES may take, by `parsed_bytes`, unless a reader allows
+more."""
 _OBJECT_BYTES = {b"[": 72, b"{": 256, b",": 48, b'"': 32}
 """Most bytes of the Python object that a sign of JSON stands for: a list, a dict, a value after a comma, half a string.
 
@@ -109,22 +110,24 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
             raise InputError(f"{path}: cannot be read ({reason_of(error)}), expected {expected}") from None
 
 
-def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
+def read_document(
+    path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES, parsed_limit: int = MAX_PARSED_BYTES
+) -> str:
     """The text of a UTF-8 file of at most `limit` bytes, without a byte order mark.
 
     expected: text that follows "expected" in error messages.
     Raises InputError like `open_input`, and for a longer file or another encoding. Also raises it for a file of more
-    than MAX_DOCUMENT_BYTES whose JSON would take more than MAX_PARSED_BYTES.
+    than MAX_DOCUMENT_BYTES whose JSON would take more than `parsed_limit` bytes of memory.
     """
     with open_input(path, expected) as file:
         size = max(os.fstat(file.fileno()).st_size, MAX_DOCUMENT_BYTES)
         data = file.read(min(limit, size) + 1)
     if len(data) > limit:
         raise InputError(f"{path}: has more than {limit >> 20} MiB, expected {expected}")
-    if len(data) > MAX_DOCUMENT_BYTES and (needed := parsed_bytes(data)) > MAX_PARSED_BYTES:
+    if len(data) > MAX_DOCUMENT_BYTES and (needed := parsed_bytes(data)) > parsed_limit:
         raise InputError(
             f"{path}: its {len(data) >> 20} MiB may take {needed >> 20:,} MiB of memory, expected {expected} that "
-            f"takes at most {MAX_PARSED_BYTES >> 20:,} MiB; remove values that are not needed"
+            f"takes at most {parsed_limit >> 20:,} MiB; remove values that are not needed"
         )
     try:
         return data.decode("utf-8-sig")

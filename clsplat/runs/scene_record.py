@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import atomic_write
@@ -31,6 +32,9 @@ MAX_SCENE_RECORD_BYTES = 256 << 20
 """Size limit of scene.json in bytes, enough for some hundred thousand views."""
 CAMERA_RELATIVE_TOLERANCE = 1e-6
 """Relative difference up to which camera parameters count as equal, because versions may round differently."""
+ONE_PLACE_SPREAD = 1e-12
+"""Recorded cameras are in one place if none is farther from their middle than this fraction of their largest
+coordinate."""
 _EXPECTED_SCENE_RECORD = "the record of a run's scene"
 
 
@@ -106,7 +110,7 @@ def read(run: Run) -> dict[str, Any] | None:
             assert {"split", "file", "folder", "blake2b", "size", "lens", "pose"} <= view.keys()
             assert all(len(np.array(view[key], float)) == n for key, n in (("size", 2), ("lens", 4), ("pose", 12)))
             assert "radial" not in view or ("projection" in view and len(np.array(view["radial"], float)) == 4)
-    except (ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, AssertionError) as error:
         why = str(error) or "its form is wrong"
         raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED_SCENE_RECORD}; {advice}") from None
     return dict(record)
@@ -151,11 +155,11 @@ def differences(earlier: dict[str, Any], now: dict[str, Any], *, moved: bool = F
         "new": [name for name in new if name not in was],
         **{what: [] for what in ("with another photograph", "with another camera", "with another size", held_out)},
     }
-    both = [name for name in was if name in new]
+    both, size = [name for name in was if name in new], _size_of(was)
     for name in both:
         a, b = was[name], new[name]
         same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
-        turned = not _same_pose(a["pose"], b["pose"])
+        turned = not _same_pose(a["pose"], b["pose"], size)
         bent = "radial" in a and (a["projection"] != b.get("projection") or not _close(a["radial"], b["radial"]))
         if turned or bent or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
             changed["with another camera"].append(name)
@@ -241,10 +245,11 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         # the first word of "blake2b" is the digest of the photograph's file, without its mask and known depths
         and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
+    size = _size_of(was)
     moved = [
         view.name
         for view in known
-        if not _same_pose(was[view.name]["pose"], [*np.ravel(view.camera.rotation), *view.camera.translation])
+        if not _same_pose(was[view.name]["pose"], [*np.ravel(view.camera.rotation), *view.camera.translation], size)
     ]
     reasons = []
     if seen:
@@ -258,9 +263,28 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
     return reasons
 
 
-def _same_pose(a: list[float], b: list[float]) -> bool:
-    """True if two recorded poses, 9 values of rotation and 3 of translation, are equal by `_close`."""
-    return _close(a[:9], b[:9]) and _close(a[9:], b[9:])
+def _size_of(views: Mapping[str, dict[str, Any]]) -> float:
+    """Return the distance of the farthest recorded camera from the cameras' middle, by which positions are compared.
+
+    So cameras far from the world's origin, as in a UTM zone, are told apart. If all cameras are in one place, their
+    largest coordinate is returned; 0 without cameras.
+    """
+    if not views:
+        return 0.0
+    centres = np.stack([_centre(view["pose"]) for view in views.values()])
+    spread, largest = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()), float(np.abs(centres).max())
+    return spread if spread > ONE_PLACE_SPREAD * largest else largest
+
+
+def _centre(pose: list[float]) -> Float64:
+    """Return the position (3,) of a camera with a recorded pose: 9 values of rotation and 3 of translation."""
+    return np.asarray(-np.reshape(pose[:9], (3, 3)).T @ np.array(pose[9:], np.float64))
+
+
+def _same_pose(a: list[float], b: list[float], size: float) -> bool:
+    """True if two recorded poses are equal up to rounding. size: as from `_size_of`."""
+    apart = float(np.abs(_centre(a) - _centre(b)).max())
+    return _close(a[:9], b[:9]) and apart <= CAMERA_RELATIVE_TOLERANCE * size
 
 
 def _close(a: list[float], b: list[float]) -> bool:

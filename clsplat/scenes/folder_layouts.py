@@ -19,7 +19,7 @@ from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_p
 from clsplat.scenes.photo_names import legible, match
 from clsplat.scenes.point_files import clouds_beside
 from clsplat.scenes.readers import colmap, transforms
-from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, survey_of
+from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, check_names, survey_of
 from clsplat.scenes.sfm.video_frames import find_videos
 from clsplat.scenes.sidecar_files import inside
 from clsplat.scenes.video.reading import is_video_name
@@ -115,8 +115,9 @@ def read_survey(path: Path, chosen: str | Path | None, missing: Missing) -> Data
     beside = found.format.is_folder and chosen is None
     folder = top if beside else _picture_folder(top, chosen, cameras, data.images)
     _add_pictures(data, folder, cameras, missing, labels=True)
+    check_names(cameras, data.images)  # IMG.xmp and IMG.jpg.xmp are cameras of one photograph
     data.images = _held_out(data, top / HELD_OUT_LIST_FILE)
-    data.clouds = clouds_beside(list(dict.fromkeys([cameras.parent, top])))
+    data.clouds = clouds_beside([cameras if found.format.is_folder else cameras.parent, top])
     return data
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from clsplat.images.decoders.colour_profiles import ADOBE_RGB, DISPLAY_P3, SrgbPhoto, space_of
-from clsplat.images.reading import image_size, open_image, read_image, stored_range
+from clsplat.images.reading import image_size, open_image, open_photograph, read_image, stored_range
 from clsplat.images.writing import write_image
 from clsplat.scenes.sfm import photos as sfm_photos
 
@@ -75,6 +75,23 @@ def test_16_bits_stay_16_bits(tmp_path: Path) -> None:
     read = read_image(tmp_path / "a.png")
     np.testing.assert_allclose(read, in_srgb_by_hand(pixels / 65535, P3, SRGB_CURVE), atol=1e-5)
     assert len(np.unique(read[:, :, 0])) == 64
+
+
+def test_a_picture_is_converted_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of one row, of three with a smaller last one, and the whole."""
+    rgb = np.random.default_rng(0).random((10, 6, 3), np.float32)
+    whole = ADOBE_RGB.to_srgb(rgb)
+    for pixels in (1, 18, 60):
+        monkeypatch.setattr("clsplat.images.decoders.colour_profiles.CONVERTED_PIXELS", pixels)
+        np.testing.assert_allclose(ADOBE_RGB.to_srgb(rgb), whole, rtol=0, atol=1e-6)  # rounding of float32
+
+
+def test_a_large_profile_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    icc = profile(P3, SRGB_CURVE)
+    path = save(tmp_path / "a.png", PIXELS, icc)
+    for limit in (len(icc), len(icc) - 1):
+        monkeypatch.setattr("clsplat.images.decoders.colour_profiles.MAX_PROFILE_BYTES", limit)
+        assert isinstance(open_photograph(path), SrgbPhoto) == (limit == len(icc))
 
 
 def test_profiles_of_other_spaces_change_nothing(tmp_path: Path) -> None:

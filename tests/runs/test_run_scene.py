@@ -10,12 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ring
+import survey_files
 from calls import Capture, refuses
 from calls import train as command_train
 from quick import quick
 from tiny import FEW, write_scene
 
 from clsplat.api import train
+from clsplat.arrays import Float64
 from clsplat.cli.main import main, parse
 from clsplat.cli.train import TrainVerb
 from clsplat.config.training import TrainConfig
@@ -122,7 +125,13 @@ def test_a_run_of_an_earlier_version_resumes_with_one_line(run: Path, own: Path,
     assert (run / scene_record.SCENE_RECORD_FILE_NAME).exists()
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"views": {"a": {}}}', '{"views": 3, "points": {}}'])
+HUGE = f'{{"views": {{}}, "points": {{"count": 1}}, "origin": [0, 0, 0], "resolution": 0, "length_unit": 1{"0" * 400}}}'
+"""A record with a number that no float64 has."""
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"views": {"a": {}}}', '{"views": 3, "points": {}}', pytest.param(HUGE, id="huge")]
+)
 def test_a_damaged_record_is_named(text: str, run: Path, own: Path, capsys: Capture) -> None:
     (run / scene_record.SCENE_RECORD_FILE_NAME).write_text(text)
     assert f"{run / scene_record.SCENE_RECORD_FILE_NAME}: is damaged" in refusal(run, own, capsys)
@@ -251,3 +260,23 @@ def test_a_lens_that_is_no_pinhole_is_recorded(scene: Path) -> None:
     assert scene_record.differences(one, one) == []
     assert scene_record.differences(one, other) == [f"1 view with another camera ({bent.name})"]
     assert scene_record.differences(one, plain) == [f"1 view with another camera ({bent.name})"]
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), survey_files.UTM_OFFSET])
+def test_cameras_that_moved_are_told_wherever_the_scene_lies(tmp_path: Path, offset: Float64) -> None:
+    """A camera that moved by a thousandth of the scene's size, also far from the origin. Rounding does not count."""
+    scene = load_scene(ring.write_colmap(tmp_path / "scene", posed=survey_files.at(offset)))
+    record, other = scene_record.record_of(scene, 0), scene_record.record_of(scene, 0)
+    view = scene.views[3]
+    for metres, told in ((1e-7, []), (0.004, [f"1 view with another camera ({view.name})"])):
+        moved = -view.camera.rotation @ (view.camera.position + np.array([metres, 0, 0]))
+        other["views"][view.name]["pose"][9:] = moved.tolist()
+        assert scene_record.differences(record, other) == told
+
+
+def test_cameras_in_one_place_differ_by_their_coordinates(tmp_path: Path) -> None:
+    posed = [ring.moved(pose, np.array([1.0, 2.0, 3.0])) for pose in ring.poses()]
+    scene = load_scene(ring.write_colmap(tmp_path / "scene", posed=posed))
+    record, other = scene_record.record_of(scene, 0), scene_record.record_of(scene, 0)
+    other["views"][scene.views[0].name]["pose"][9] += 1e-7
+    assert scene_record.differences(record, other) == []

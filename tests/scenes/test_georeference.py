@@ -75,6 +75,23 @@ def test_a_record_comes_back(tmp_path: Path, code: int) -> None:
     assert (found.epsg, found.residuals, found.note) == (code, wanted.residuals, "from here")
 
 
+@pytest.mark.parametrize("code", [4491, 4549, 4554, 4647, 4839, 4978, 32632])
+def test_systems_in_metres_are_read_whatever_their_code(tmp_path: Path, code: int) -> None:
+    """The codes of Gauss-Kruger zones of CGCS2000, and of UTM zone 32 of ETRS89, lie among those in degrees."""
+    path = tmp_path / GEOREFERENCE_FILE
+    path.write_text(json.dumps({"epsg": code}))
+    found = read_georeference(path)
+    assert found is not None
+    assert found.epsg == code
+
+
+@pytest.mark.parametrize("code", [4001, 4258, 4326, 4490, 4555, 4979])
+def test_systems_in_degrees_are_refused(tmp_path: Path, code: int) -> None:
+    path = tmp_path / GEOREFERENCE_FILE
+    path.write_text(json.dumps({"epsg": code}))
+    refuses(f"EPSG:{code} counts in degrees", read_georeference, path)
+
+
 def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
     place = Georeference(32632, survey_files.UTM_OFFSET, 2 * np.eye(3))
     points = np.random.default_rng(1).normal(size=(20, 3))
@@ -94,6 +111,10 @@ def test_a_change_of_the_scene_changes_no_place_on_the_earth() -> None:
         ('{"epsg": 32632, "origin": [1, 2]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "origin": [1, 2, NaN]}', "'origin' is .*, expected three numbers"),
         ('{"epsg": 32632, "transform": [[1,0,0],[0,1,0],[0,0,2]]}', "'transform' is .*, expected a rotation times a"),
+        (
+            '{"epsg": 32632, "transform": [[1e200,0,0],[0,1e200,0],[0,0,1e200]]}',
+            "'transform' is .*, expected a rotation",
+        ),
         ('{"epsg": 32632, "transform": [[1,0,0],[0,1,0],[0,0,-1]]}', "'transform' is .*, expected a rotation times a"),
     ],
 )
@@ -168,3 +189,14 @@ def test_converted_models_get_it(tmp_path: Path, capsys: Capture) -> None:
     random_gaussians(20, 0).save(plain)
     printed(capsys, ["convert", plain, further, "--overwrite"])
     assert read_of_model(further) is None
+
+
+def test_a_mirrored_model_gets_no_place(tmp_path: Path, capsys: Capture) -> None:
+    """A record with a mirror would be refused when it is read."""
+    source, target = tmp_path / "model.ply", tmp_path / "mirrored.ply"
+    random_gaussians(20, 0).save(source)
+    beside_model(source).write_bytes(Georeference(32632, survey_files.UTM_OFFSET).content())
+    mirror = ",".join(map(str, np.diag([-1, 1, 1, 1]).ravel().tolist()))
+    told = printed(capsys, ["convert", source, target, f"--transform={mirror}"]).err
+    assert "mirrored.ply: gets no mirrored.georeference.json, as the model is mirrored" in told
+    assert read_of_model(target) is None

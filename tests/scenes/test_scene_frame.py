@@ -28,6 +28,7 @@ from clsplat.scenes.dataset import SOURCE_FRAME, SceneFrame
 from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
+from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.readers.colmap import read_model
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.sfm.framing import MODEL_FOLDER, scale_new, set_frame, turn_new
@@ -155,6 +156,29 @@ def test_gps_scales_with_and_without_a_turn(
         np.testing.assert_allclose(turned_by, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.parametrize("orient", ["up", None])
+def test_the_same_gps_again_changes_nothing(
+    orient: Literal["up"] | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = np.stack([ring.centre_of(pose) for pose in ring.poses()])
+    off = np.random.default_rng(0).normal(
+        size=places.shape
+    )  # errors of a metre, so that the fit is none without residual
+    globe = pycolmap.GPSTransform().enu_to_ellipsoid(10 * places[:, [0, 2, 1]] * (1, 1, -1) + off, -33.0, 151.0, 20.0)
+    positions = {name: GpsPosition(*row) for name, row in zip(ring.NAMES, globe.tolist(), strict=True)}
+    monkeypatch.setattr("clsplat.scenes.orientation.new_frame.gps_of", lambda path: positions[path.name])
+    monkeypatch.setattr("clsplat.scenes.orientation.new_frame.gravity_of", lambda path, upright: None)
+    data = read_model(folder / "sparse" / "0")
+    files = {name: Path(name) for name in ring.NAMES}
+    use = FrameUse(orient, "gps")
+    frame = new_frame("scene", data, files, use, data.frame, turned=True)
+    change = frame.change_from(data.frame)
+    assert change is not None
+    again = in_frame(data, change)
+    for repeated in (use, FrameUse(None, "gps")):
+        assert new_frame("scene", again, files, repeated, frame, turned=True) is frame
+
+
 def test_a_transforms_json_is_turned_too(tmp_path: Path) -> None:
     posed, cloud = turned()
     folder = ring.write_transforms(
@@ -239,6 +263,12 @@ def test_points_measured_before_the_scene_was_scaled(result: Path) -> None:
         assert frame.scale_note.startswith(f"metres are from the known length {scale}: a unit was ")
         if factor is not None:
             np.testing.assert_allclose(load_scene(result).points, factor * before, atol=1e-12)
+
+
+def test_the_same_points_in_the_other_order_are_the_same(result: Path) -> None:
+    first = set_frame(result, result / "images", FrameUse(None, "0,0,0,0.5,0,0=2"), result)
+    again = set_frame(result, result / "images", FrameUse(None, "0.5,0,0,0,0,0=2"), result)
+    np.testing.assert_array_equal(again.world_from_source, first.world_from_source)
 
 
 def test_a_run_keeps_its_frame_when_the_scene_gets_another(result: Path) -> None:
@@ -401,8 +431,11 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         {"metres": None},
         {"origin": [1]},
         {"origin": ["a", "b", "c"]},
+        {"origin": [np.nan, 0, 0]},
+        {"origin": [10**400, 0, 0]},
         {"measured": [1, 2, 3]},
         {"measured": [0, 0, 0, 1, 0, 0, 0]},
+        {"measured": [10**400, 0, 0, 1, 0, 0, 1]},
         {"up_note": 3},
         {"scale_note": None},
     ],

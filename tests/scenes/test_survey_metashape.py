@@ -11,6 +11,7 @@ import ring
 import survey_files
 from calls import refuses, warned
 
+from clsplat.files.xml_documents import read_xml
 from clsplat.scenes.dataset import DataSet
 from clsplat.scenes.geography.georeference import on_tangent_plane, place_of
 from clsplat.scenes.loading import load_scene
@@ -158,6 +159,20 @@ def test_wrong_cameras_of_metashape_are_one_line(tmp_path: Path, old: str, new: 
     assert old in text
     path.write_text(text.replace(old, new))
     refuses(f"cameras.xml.*{told}", load_scene, tmp_path)
+
+
+def test_elements_and_attributes_of_xml_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attributes count too: a file of 256 MiB has room for 40 million."""
+    path = tmp_path / "cameras.xml"
+    monkeypatch.setattr("clsplat.files.xml_documents.MAX_XML_PARTS", 10)
+    for elements, attributes in ((9, 0), (0, 9), (10, 0), (0, 10)):
+        path.write_text(
+            f"<document {' '.join(f'a{i}=' + repr('') for i in range(attributes))}>{'<b/>' * elements}</document>"
+        )
+        if elements + attributes < 10:
+            assert len(read_xml(path, "cameras")) == elements
+        else:
+            refuses("is not readable XML: it has more than 10 elements and attributes", read_xml, path, "cameras")
 
 
 def test_a_transform_that_is_no_similarity_is_refused(tmp_path: Path) -> None:

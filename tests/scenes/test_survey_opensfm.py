@@ -14,8 +14,13 @@ import ring
 import survey_files
 from calls import refuses, warned
 
+from clsplat.files.documents import parsed_bytes
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.readers.surveys.opensfm import read_reconstruction
+from clsplat.scenes.readers.surveys.opensfm import (
+    MAX_RECONSTRUCTION_BYTES,
+    MAX_RECONSTRUCTION_MEMORY_BYTES,
+    read_reconstruction,
+)
 
 LENGTH = max(ring.WIDTH, ring.HEIGHT)
 BROWN = {"projection_type": "brown", "focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": -0.02}
@@ -58,12 +63,15 @@ def test_the_lens_follows_opensfms_formula(tmp_path: Path) -> None:
     np.testing.assert_allclose(lens.img_from_cam(np.array([[x, y, z]]))[0], wanted, rtol=1e-12)
 
 
-def test_a_project_of_webodm_is_read_from_its_folder(tmp_path: Path) -> None:
+def test_a_project_of_webodm_is_read_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     survey_files.write_opensfm(tmp_path)
     (tmp_path / "opensfm").mkdir()
     (tmp_path / "reconstruction.json").rename(tmp_path / "opensfm" / "reconstruction.json")
     for path in (tmp_path, tmp_path / "opensfm", tmp_path / "opensfm" / "reconstruction.json"):
         assert len(load_scene(path).views) == ring.COUNT
+    monkeypatch.chdir(tmp_path / "opensfm")  # so that the folder's name is not in the path
+    for name in (".", "reconstruction.json"):
+        assert len(load_scene(name).views) == ring.COUNT
 
 
 def test_the_largest_of_several_reconstructions_is_used(tmp_path: Path) -> None:
@@ -130,6 +138,44 @@ def test_a_reference_that_is_not_of_these_cameras_is_not_used(tmp_path: Path) ->
         "its cameras are 5,4.. km from its reference_lla, expected less than 100 km", read_reconstruction, path
     )
     assert data.georeference is None
+
+
+def test_odms_cameras_before_its_map_projection_are_read(tmp_path: Path) -> None:
+    """ODM renames OpenSfM's file, and writes cameras in a UTM zone to reconstruction.json. Both have reference_lla."""
+    place = {"latitude": 48.0, "longitude": 11.0, "altitude": 0.0}
+    (tmp_path / "opensfm").mkdir()
+    path = survey_files.write_opensfm(tmp_path, reference_lla=place)
+    topocentric = path.rename(tmp_path / "opensfm" / "reconstruction.topocentric.json")
+    turned = survey_files.at(np.array([5.0, 0, 0]))
+    projected = survey_files.write_opensfm(tmp_path, turned, reference_lla=place).rename(
+        tmp_path / "opensfm" / "reconstruction.json"
+    )
+    for given in (tmp_path, tmp_path / "opensfm", topocentric):
+        scene = load_scene(given)
+        assert scene.georeference is not None
+        np.testing.assert_allclose(scene.views[0].camera.position, ring.centre_of(ring.poses()[0]), atol=1e-9)
+    data = warned("map projection, which reference_lla does not fit", read_reconstruction, projected)
+    assert data.georeference is None
+    np.testing.assert_allclose(data.images[0].translation, turned[0][1], atol=1e-9)
+
+
+@pytest.mark.parametrize("indent", [None, 4])
+def test_a_million_points_are_within_the_limits(tmp_path: Path, indent: int | None) -> None:
+    """Without indentation, and with that of OpenSfM."""
+    count = 500
+    path = survey_files.write_opensfm(tmp_path, optics=[survey_files.RING] * ring.COUNT, cloud=ring.points(count))
+    data = json.dumps(json.loads(path.read_text()), indent=indent).encode()
+    assert len(data) * 1_000_000 / count < MAX_RECONSTRUCTION_BYTES
+    assert parsed_bytes(data) * 1_000_000 / count < MAX_RECONSTRUCTION_MEMORY_BYTES
+
+
+def test_two_names_of_one_photograph_are_one_line(tmp_path: Path) -> None:
+    """Both names are that of the same file below the folder of photographs."""
+    path = survey_files.write_opensfm(tmp_path, reference_lla={"latitude": 48.0, "longitude": 11.0, "altitude": 500.0})
+    (part,) = json.loads(path.read_text())
+    part["shots"][f"../{ring.NAMES[0]}"] = part["shots"][ring.NAMES[0]]
+    path.write_text(json.dumps([part]))
+    refuses("lists view00.png twice, expected each photograph once", load_scene, tmp_path)
 
 
 def change_shot(part: dict[str, Any], **keys: Any) -> None:

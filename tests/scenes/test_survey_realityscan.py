@@ -14,7 +14,7 @@ from calls import refusal, refuses
 from clsplat.scenes.dataset import DataSet
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.readers.surveys.realityscan import read_xmp
+from clsplat.scenes.readers.surveys.realityscan import MAX_XMP_BYTES, read_xmp
 
 
 def xmp(folder: Path, model: str, coefficients: str) -> DataSet:
@@ -89,6 +89,26 @@ def test_xmp_files_named_after_the_whole_file(tmp_path: Path) -> None:
     for path in sorted(tmp_path.glob("*.xmp")):
         path.rename(path.with_suffix(".png.xmp"))
     assert [view.name for view in load_scene(tmp_path).views] == ring.NAMES
+
+
+def test_a_large_xmp_file_is_refused(tmp_path: Path) -> None:
+    path = survey_files.write_xmp(tmp_path) / "view07.xmp"
+    path.write_text(path.read_text() + " " * MAX_XMP_BYTES)
+    refuses("view07.xmp: has more than 1 MiB, expected RealityScan's XMP file", load_scene, tmp_path)
+
+
+def test_two_xmp_files_of_one_photograph_are_one_line(tmp_path: Path) -> None:
+    survey_files.write_xmp(tmp_path)
+    (tmp_path / "view03.png.xmp").write_text((tmp_path / "view03.xmp").read_text())
+    refuses("lists view03.png twice, expected each photograph once", load_scene, tmp_path)
+
+
+def test_a_cloud_above_the_photographs_is_not_theirs(tmp_path: Path) -> None:
+    folder = survey_files.write_xmp(tmp_path / "photos")
+    ring.write_cloud(tmp_path / "points3D.ply", *ring.points())
+    assert not len(load_scene(folder).points)
+    (tmp_path / "points3D.ply").rename(folder / "points3D.ply")
+    assert len(load_scene(folder).points) == len(ring.points()[0])
 
 
 def test_a_mask_beside_a_photograph_is_not_the_photograph(tmp_path: Path) -> None:

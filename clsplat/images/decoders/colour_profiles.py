@@ -30,6 +30,11 @@ MAX_SAME_SPACE_LEVELS = 2.0
 With a larger one the profile describes another space. Two roundings to 8 bits account for 1, and the precision of
 curves in profiles for the rest.
 """
+MAX_PROFILE_BYTES = 1 << 20
+"""Largest size in bytes of an ICC profile that is read. Display P3 and Adobe RGB take up to 4 KB, and `space_of` keeps
+64 profiles in memory."""
+CONVERTED_PIXELS = 1 << 20
+"""Number of pixels that OpenImageIO converts at once. A conversion takes seven times the memory of its pixels."""
 _BUILT_IN_CONFIG = "ocio://default"
 """OpenImageIO's name of the OpenColorIO configuration, which does not depend on the user's variable OCIO."""
 
@@ -47,6 +52,12 @@ class WideSpace:
 
     def to_srgb(self, rgb: Float32) -> Float32:
         """Convert colours (H, W, 3) from 0 to 1. Colours that sRGB does not have are clipped to 0 and 1."""
+        srgb, rows = np.empty(rgb.shape, np.float32), max(1, CONVERTED_PIXELS // rgb.shape[1])
+        for first in range(0, len(rgb), rows):
+            srgb[first : first + rows] = self._rows_to_srgb(rgb[first : first + rows])
+        return srgb
+
+    def _rows_to_srgb(self, rgb: Float32) -> Float32:
         source = oiio.ImageBuf(np.ascontiguousarray(self.to_linear(rgb), np.float32))
         made = oiio.ImageBufAlgo.colorconvert(
             source, self.linear, "Linear Rec.709 (sRGB)", colorconfig=_BUILT_IN_CONFIG
@@ -123,14 +134,15 @@ class SrgbPhoto:
 def in_srgb(source: Any) -> Any:
     """Return an open image whose pixels are in sRGB: an `SrgbPhoto` if its ICC profile is that of a `WideSpace`.
 
-    Other images are returned unchanged: without a profile, with a profile of another space, grey, or of floats.
+    Other images are returned unchanged: without a profile, with a profile of another space or of more than
+    MAX_PROFILE_BYTES, grey, or of floats.
     """
     spec = source.spec()
     profile = spec.getattribute(ICC_PROFILE_ATTRIBUTE)
     if profile is None or spec.nchannels not in (3, 4) or not str(spec.format).startswith("uint"):
         return source
     content = np.asarray(profile, np.uint8).tobytes()
-    space = space_of(content)
+    space = space_of(content) if len(content) <= MAX_PROFILE_BYTES else None
     return source if space is None else SrgbPhoto(source, space, content)
 
 

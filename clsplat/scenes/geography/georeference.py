@@ -25,15 +25,23 @@ MAX_GEOREFERENCE_BYTES = 1 << 20
 """Size limit of georeference.json in bytes."""
 GEOCENTRIC_EPSG = 4978
 """EPSG code of WGS 84 geocentric coordinates (x, y, z in metres from the earth's centre)."""
-GEOGRAPHIC_EPSG_CODES = frozenset(
-    {4148, 4167, 4171, 4230, 4258, 4267, 4269, 4277, 4283, 4284, 4289, 4301, 4312, 4314, 4322, 4326, 4480, 4490, 4612}
-    | {4617, 4619, 4674, 4737, 4937, 4979, 6318, 6668, 7844}
-)
-"""EPSG codes of widely used systems in degrees: WGS 84, ETRS89, NAD83, GDA2020 and other countries' systems."""
+GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
+"""EPSG codes whose coordinates are latitude and longitude in degrees, except for those of METRIC_EPSG_RANGES."""
+OTHER_GEOGRAPHIC_EPSG_CODES = (6318, 6668, 7844)
+"""EPSG codes of further widely used systems in degrees: NAD83(2011), JGD2011 and GDA2020."""
+METRIC_EPSG_RANGES = (
+    (4026, 4026), (4037, 4038), (4048, 4051), (4056, 4071), (4082, 4100), (4217, 4217), (4390, 4462), (4467, 4467),
+    (4471, 4471), (4474, 4474), (4484, 4489), (4491, 4554), (4559, 4589), (4647, 4656), (4766, 4800), (4812, 4812),
+    (4822, 4822), (4826, 4880), (4936, 4936), (GEOCENTRIC_EPSG, GEOCENTRIC_EPSG),
+)  # fmt: skip
+"""First and last codes of projected and geocentric systems among GEOGRAPHIC_EPSG_CODES, such as China's Gauss-Kruger
+zones (4491 to 4554) and UTM zone 32 with its number before the easting (4647). From version 11.022 of the data set."""
 MAX_EPSG_CODE = 1_000_000
 """EPSG codes are less than this number."""
 SIMILARITY_SLACK = 1e-6
 """Largest relative deviation of a transform from a rotation times a scale. Numbers with 7 digits deviate by less."""
+MAX_TRANSFORM_VALUE = 1e12
+"""Limit of the values of a transform. Squares of much larger values may overflow."""
 DOUBTED_MEDIANS, MIN_DOUBTED_METRES = 6.0, 30.0
 """A GPS position is not used if its distance from its camera is over DOUBTED_MEDIANS times the median distance and over
 MIN_DOUBTED_METRES."""
@@ -183,7 +191,8 @@ def _epsg(path: Path, code: Any) -> int:
     if isinstance(code, bool) or not isinstance(code, int) or not 0 < code < MAX_EPSG_CODE:
         found = "has no 'epsg'" if code is None else f"'epsg' is {str(code)[:60]}"
         raise InputError(f"{path}: {found}, expected the number of an EPSG code, such as 32632")
-    if code in GEOGRAPHIC_EPSG_CODES:
+    is_metric = any(first <= code <= last for first, last in METRIC_EPSG_RANGES)
+    if code in OTHER_GEOGRAPHIC_EPSG_CODES or (code in GEOGRAPHIC_EPSG_CODES and not is_metric):
         raise InputError(
             f"{path}: EPSG:{code} counts in degrees, expected a coordinate reference system in metres, such as a UTM "
             "zone (32632); export the cameras again in such a system"
@@ -199,7 +208,7 @@ def _residuals(given: Any) -> GpsResiduals | None:
 
 
 def _is_similarity(axes: Float64) -> bool:
-    if axes.shape != (3, 3) or not np.isfinite(axes).all():
+    if axes.shape != (3, 3) or not (np.abs(axes) < MAX_TRANSFORM_VALUE).all():
         return False
     squares = axes.T @ axes
     size = float(np.trace(squares)) / 3

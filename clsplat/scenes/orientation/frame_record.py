@@ -37,12 +37,13 @@ def read_frame(folder: Path) -> SceneFrame:
         assert isinstance(upright, bool)
         assert isinstance(metres, bool)
         assert len(origin) in (0, 3)
+        assert all(abs(value) < np.inf for value in origin)
         assert len(measured) in (0, 7)
         assert all(abs(value) < np.inf for value in measured)
         assert all(value > 0 for value in measured[6:])
         assert all(isinstance(note, str) for note in notes)
         frame = SceneFrame(matrix, upright, metres, tuple(float(value) for value in origin), measured, *notes)
-    except (ValueError, KeyError, TypeError, AssertionError, InputError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, AssertionError, InputError) as error:
         raise InputError(
             f"{path}: is damaged ({str(error) or 'its form is wrong'}), expected {_EXPECTED_FRAME_RECORD}; make the "
             "scene or the run again, or remove the file if nothing needs the earlier frame"

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,8 @@ from clsplat.scenes.orientation.upright import MIN_UPRIGHT_CAMERAS, Upright, up_
 from clsplat.scenes.outliers import stray_cameras
 
 SAME_SCALE_TOLERANCE = 1e-9
-"""Relative difference of two scales that counts as rounding, so that the same --scale changes nothing again."""
+"""Relative difference of two scales, or of places, that counts as rounding, so that the same --scale again changes
+nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +127,21 @@ def new_frame(
                 places = {name: factor * moved(one.position, change) for name, one in subject.cameras.items()}
                 known = replace(known, origin=globe_position(fit, subject.positions, places))
         change = scaling(factor) @ change
+        marks = [(one.upright, one.metres, bool(one.origin)) for one in (frame, replace(known, metres=True))]
+        if by_gps and marks[0] == marks[1] and _is_rounding(change, subject.cameras.values()):
+            return frame  # which has the note of the first fit
         if not (frame.metres and factor == 1):
             known = replace(known, metres=True, scale_note=f"metres are from {note}: a unit was {unit:.6g} m")
     matrix = change @ frame.world_from_source
     if use.orient == "none":  # without rounding errors, so that the axes are exactly the source's
         matrix = scaling(round(decompose(matrix)[0], 12))
     return replace(known, world_from_source=matrix)
+
+
+def _is_rounding(change: Float64, cameras: Iterable[Camera]) -> bool:
+    """Return True if a similarity (4, 4) moves no camera but by rounding, as the same fit to GPS positions again."""
+    places = np.stack([camera.position for camera in cameras])
+    return bool(np.abs(moved(places, change) - places).max() <= SAME_SCALE_TOLERANCE * np.abs(places).max())
 
 
 def _to_metres(unit: float, rule: ScaleRule, frame: SceneFrame) -> tuple[float, SceneFrame]:
@@ -142,7 +152,8 @@ def _to_metres(unit: float, rule: ScaleRule, frame: SceneFrame) -> tuple[float, 
     unit: length in metres of the unit in which the rule's points or cameras were measured.
     """
     now = decompose(frame.world_from_source)[0]
-    then = frame.measured[6] if rule.kind == "points" and frame.measured[:6] == rule.ends else now
+    either_way = (rule.ends, rule.ends[3:] + rule.ends[:3])
+    then = frame.measured[6] if rule.kind == "points" and frame.measured[:6] in either_way else now
     factor = unit * then / now
     if rule.kind == "points":
         frame = replace(frame, measured=(*rule.ends, then))

@@ -139,13 +139,18 @@ def safe_name(name: str) -> bool:
     return bool(path.parts) and inside and is_legible(name)
 
 
-def _named(path: Path, name: str) -> str:
+def name_inside(name: str) -> str | None:
     """Return the name of a picture without a drive, root or "..", so that it is a path inside the images' folder.
 
-    `photo_names.match` then finds the picture by the last parts of its path. Raises InputError if this is impossible.
+    `photo_names.match` then finds the picture by the last parts of its path. Returns None if nothing legible is left.
     """
     inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
-    if not safe_name(inner):
+    return inner if safe_name(inner) else None
+
+
+def _named(path: Path, name: str) -> str:
+    """Return a picture's name as by `name_inside`. Raises InputError if nothing legible is left."""
+    if (inner := name_inside(name)) is None:
         raise corrupt(path, f"an image has the name {name[:80]!r}, expected a path inside the images' folder")
     return inner
 

@@ -94,8 +94,9 @@ def survey_of(path: Path) -> Survey | None:
         cameras = (path if row.is_one(path) else None) if is_file(path) else row.find(path)
         if cameras is not None:
             folder = cameras.parent if is_file(cameras) else cameras
-            of_project = folder.name == OPENSFM_FOLDER and not (folder / "images").is_dir()
-            return Survey(cameras, row, folder.parent if of_project else folder)
+            whole = folder.absolute()  # its name may not be in the path: "." and reconstruction.json
+            of_project = whole.name == OPENSFM_FOLDER and not (folder / "images").is_dir()
+            return Survey(cameras, row, whole.parent if of_project else folder)
     return None
 
 

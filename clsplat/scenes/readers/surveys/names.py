@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from clsplat.errors import InputError
-from clsplat.scenes.photo_names import slashed
-from clsplat.scenes.readers.colmap import safe_name
+from clsplat.scenes.readers.colmap import name_inside
 
 
 def inner_name(where: str, name: str) -> str:
@@ -14,7 +13,6 @@ def inner_name(where: str, name: str) -> str:
     where: beginning of the error message.
     Raises InputError if nothing legible is left.
     """
-    inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
-    if not safe_name(inner):
+    if (inner := name_inside(name)) is None:
         raise InputError(f"{where}: has the name {name[:80]!r}, expected a photograph's file name; export it again")
     return inner

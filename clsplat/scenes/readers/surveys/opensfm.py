@@ -25,12 +25,16 @@ from clsplat.scenes.readers.surveys.names import inner_name
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 """Name of the file in OpenSfM's folder."""
+TOPOCENTRIC_FILE = "reconstruction.topocentric.json"
+"""Name that ODM gives to OpenSfM's RECONSTRUCTION_FILE. ODM then writes a RECONSTRUCTION_FILE with cameras and points
+in a UTM zone, less an offset, and still with `reference_lla`."""
 OPENSFM_FOLDER = "opensfm"
 """Folder of an ODM or WebODM project with RECONSTRUCTION_FILE. The photographs are in images/ next to the folder."""
 REFERENCE_FILE = "reference_lla.json"
 """File next to RECONSTRUCTION_FILE with the place of the world's origin, in older versions."""
-MAX_RECONSTRUCTION_BYTES = 256 << 20
-"""Largest size of a reconstruction.json in bytes. MAX_PARSED_BYTES allows about 750,000 points, by their memory."""
+MAX_RECONSTRUCTION_BYTES, MAX_RECONSTRUCTION_MEMORY_BYTES = 512 << 20, 2 << 30
+"""Largest size of a reconstruction.json in bytes, and most memory in bytes that it may take (`parsed_bytes`). A million
+points take 130 MB, or 350 MB with OpenSfM's indentation, and by the estimate up to 1.6 GB of memory."""
 RECONSTRUCTION_HEAD_BYTES = 4096
 """Number of bytes at the beginning of a file by which a reconstruction.json with another name is recognised."""
 NO_GPS_DOP = 1e5
@@ -46,8 +50,12 @@ EXPECTED_RECONSTRUCTION = "OpenSfM's or WebODM's reconstruction.json"
 
 
 def find_reconstruction(folder: Path) -> Path | None:
-    """Return the path of reconstruction.json in a folder or its sub-folder opensfm/; None if there is none."""
-    candidates = (folder / RECONSTRUCTION_FILE, folder / OPENSFM_FOLDER / RECONSTRUCTION_FILE)
+    """Return the path of reconstruction.json in a folder or its sub-folder opensfm/; None if there is none.
+
+    ODM's reconstruction.topocentric.json is preferred, as its cameras fit `reference_lla`.
+    """
+    names = (TOPOCENTRIC_FILE, RECONSTRUCTION_FILE)
+    candidates = (parent / name for parent in (folder, folder / OPENSFM_FOLDER) for name in names)
     return next((path for path in candidates if is_file(path)), None)
 
 
@@ -87,7 +95,8 @@ def read_reconstruction(path: Path) -> DataSet:
 def _parts(path: Path) -> list[dict[str, Any]]:
     """Return the file's reconstructions that have photographs."""
     try:
-        document = parse_json(read_document(path, EXPECTED_RECONSTRUCTION, MAX_RECONSTRUCTION_BYTES), once=True)
+        text = read_document(path, EXPECTED_RECONSTRUCTION, MAX_RECONSTRUCTION_BYTES, MAX_RECONSTRUCTION_MEMORY_BYTES)
+        document = parse_json(text, once=True)
     except ValueError as error:
         raise InputError(f"{path}: is not JSON: {error}; expected {EXPECTED_RECONSTRUCTION}") from None
     if not isinstance(document, list) or not all(isinstance(part, dict) for part in document):
@@ -165,6 +174,12 @@ def _georeference(
             raise InputError(f"{where}: is not JSON: {error}; expected latitude, longitude and altitude") from None
     if place is None:
         return None
+    if path.name == RECONSTRUCTION_FILE and is_file(path.with_name(TOPOCENTRIC_FILE)):
+        warn(
+            f"{path}: ODM brought its cameras to a map projection, which reference_lla does not fit; for their place "
+            f"on the earth, give the folder or its {TOPOCENTRIC_FILE}"
+        )
+        return None
     if not isinstance(place, dict):
         raise InputError(f"{where}: 'reference_lla' is {short(place)}, expected latitude, longitude and altitude")
     keys = Keys(where, "reference_lla", place, {})
@@ -173,8 +188,8 @@ def _georeference(
         return None
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise keys.wrong("latitude" if abs(latitude) > 90 else "longitude", "degrees on the earth")
-    centres = {image.name: -image.rotation.T @ image.translation for image in images}
-    away = float(np.linalg.norm(np.median([*centres.values()], axis=0)))
+    centres = np.stack([-image.rotation.T @ image.translation for image in images])
+    away = float(np.linalg.norm(np.median(centres, axis=0)))
     if away > MAX_PLANE_METRES:
         warn(
             f"{path}: its cameras are {away / 1000:,.0f} km from its reference_lla, expected less than "
@@ -182,8 +197,8 @@ def _georeference(
         )
         return None
     distances = {}
-    for shot, (name, centre) in zip(shots.values(), centres.items(), strict=True):
+    for shot, image, centre in zip(shots.values(), images, centres, strict=True):
         if shot.get("gps_position") is not None and (shot.number("gps_dop") or 0.0) < NO_GPS_DOP:
-            distances[name] = float(np.linalg.norm(shot.vector("gps_position", 3) - centre))
+            distances[image.name] = float(np.linalg.norm(shot.vector("gps_position", 3) - centre))
     note = "reference_lla of reconstruction.json: x east, y north, z up"
     return on_tangent_plane((latitude, longitude, altitude), note, GpsResiduals.of(path, distances))

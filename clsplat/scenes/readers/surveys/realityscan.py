@@ -36,7 +36,7 @@ XCR_BYTES = XCR[1:-1].encode()
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
 """Name of the XMP element that has the values as attributes or as elements."""
 MAX_XMP_BYTES = 1 << 20
-"""Number of bytes of an XMP file that are searched for RealityScan's namespace."""
+"""Largest size of an XMP file in bytes. RealityScan's have about 2 KB. All files of a folder are kept in memory."""
 EXPECTED_XMP = "RealityScan's XMP file"
 XMP_FILES = "a folder of photographs with RealityScan's XMP files"
 FRAME_WIDTH_MM = 36.0
@@ -107,7 +107,7 @@ class _Xmp:
 
     @cached_property
     def _elements(self) -> list[Element]:
-        root = read_xml(self.path, EXPECTED_XMP)
+        root = read_xml(self.path, EXPECTED_XMP, MAX_XMP_BYTES)
         return [each for each in root.iter() if each.tag in (DESCRIPTION, "Description")]
 
     def text(self, key: str) -> str | None:
