@@ -50,7 +50,7 @@ from clsplat.scenes.readers import colmap, transforms
 def test_a_sample_of_every_reader() -> None:
     tallies = stress(list(READERS), 500, seed=7, jobs=2)
     assert {name: tally.failures for name, tally in tallies.items() if tally.failures} == {}
-    assert sum(tally.cases for tally in tallies.values()) >= 490
+    assert sum(tally.cases for tally in tallies.values()) > 500 - len(READERS)  # each has as many
     refused = {name for name, tally in tallies.items() if tally.refused}
     assert refused >= {"ply", "colmap-bin", "colmap-txt", "transforms", "config"}, "nothing was spoilt"
 
