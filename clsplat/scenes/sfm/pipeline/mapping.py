@@ -10,6 +10,9 @@ import pycolmap
 
 MIN_MODEL_PHOTOS = 3
 """Minimum number of photographs in a model."""
+MIN_SHOWN_POINTS = 15
+"""Minimum number of points that a photograph of the global mapper shows. The incremental mapper places a photograph by
+at least this many, with its lower thresholds."""
 GLOBAL_ADJUSTMENT_GROWTH = 1.3
 """Factor by which a model grows, in photographs or points, before all its poses and points are adjusted again.
 pycolmap's default is 1.1."""
@@ -74,7 +77,33 @@ def global_models(database: Path, photos: Path, output: Path, *, threads: int, s
     models: dict[int, pycolmap.Reconstruction] = pycolmap.global_mapping(
         database_path=database, image_path=photos, output_path=output, options=options
     )
-    return {output / str(index): model for index, model in models.items()}
+    found = {output / str(index): model for index, model in models.items()}
+    for folder, model in found.items():
+        remove_implausible(model)
+        model.write(folder)
+    return {folder: model for folder, model in found.items() if model.num_reg_images() >= MIN_MODEL_PHOTOS}
+
+
+def remove_implausible(model: pycolmap.Reconstruction) -> None:
+    """Remove the photographs that show fewer than MIN_SHOWN_POINTS points, or whose camera no lens has, from a model.
+
+    The global mapper keeps photographs that lost all points, with a focal length that may be negative then. The limits
+    of a camera are those of COLMAP's incremental mapper.
+    """
+    limits = pycolmap.IncrementalPipelineOptions()
+    bounds = limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
+    while True:
+        images = [model.images[image] for image in model.reg_image_ids()]
+        frames = {
+            image.frame_id
+            for image in images
+            if image.num_points3D < MIN_SHOWN_POINTS or model.cameras[image.camera_id].has_bogus_params(*bounds)
+        }
+        if not frames:
+            break
+        for frame in frames:  # other photographs lose the points that only they still show
+            model.deregister_frame(frame)
+    model.tear_down()  # cameras without photographs
 
 
 def fragments(models: Models) -> tuple[Path, list[list[str]]]:

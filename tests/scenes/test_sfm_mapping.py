@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models that the mappers give, made by pycolmap's synthetic scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pycolmap
+import pytest
+
+from clsplat.scenes.sfm.pipeline import mapping
+
+PHOTOS = 8
+
+
+def synthetic(points: int = 60) -> pycolmap.Reconstruction:
+    """A model in which each photograph has its own camera, and shows all points."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = PHOTOS, 1, 1
+    options.num_points3D = points
+    pycolmap.set_random_seed(0)
+    return pycolmap.synthesize_dataset(options)
+
+
+def spoil(model: pycolmap.Reconstruction) -> list[int]:
+    """Give one photograph a negative focal length, and take all points from another. Returns the remaining ones."""
+    first, second, *others = sorted(model.reg_image_ids())
+    camera = model.cameras[model.images[first].camera_id]
+    camera.params = [-camera.params[0], *camera.params[1:]]
+    for index, point in enumerate(model.images[second].points2D):
+        if point.has_point3D():
+            model.delete_observation(second, index)
+    return others
+
+
+def test_a_plausible_model_stays() -> None:
+    model = synthetic()
+    mapping.remove_implausible(model)
+    assert (model.num_reg_images(), len(model.cameras), model.num_points3D()) == (PHOTOS, PHOTOS, 60)
+
+
+def test_photographs_without_points_and_with_impossible_cameras_go() -> None:
+    model = synthetic()
+    others = spoil(model)
+    mapping.remove_implausible(model)
+    assert sorted(model.reg_image_ids()) == others
+    assert len(model.cameras) == len(others)
+
+
+@pytest.mark.parametrize(
+    ("points", "left"), [(mapping.MIN_SHOWN_POINTS, PHOTOS - 2), (mapping.MIN_SHOWN_POINTS - 1, 0)]
+)
+def test_the_global_mapper_gives_no_others(
+    points: int, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = synthetic(points)
+    spoil(model)
+
+    def global_mapping(*, output_path: Path, **_: object) -> dict[int, pycolmap.Reconstruction]:
+        (output_path / "0").mkdir()
+        return {0: model}
+
+    monkeypatch.setattr(pycolmap, "calibrate_view_graph", lambda **_: True)
+    monkeypatch.setattr(pycolmap, "global_mapping", global_mapping)
+    found = mapping.global_models(tmp_path, tmp_path, tmp_path / "out", threads=1, seed=0)
+    assert [each.num_reg_images() for each in found.values()] == ([left] if left else [])
+    if left:
+        assert pycolmap.Reconstruction(tmp_path / "out" / "0").num_reg_images() == left, "it is written again"
