@@ -12,10 +12,9 @@ from typing import Any
 
 from clsplat.errors import InputError, examples
 from clsplat.files.atomic import atomic_write, remove
-from clsplat.files.documents import is_file
+from clsplat.files.documents import is_file, load_document
 from clsplat.report import REPORT_FILE_NAME
 from clsplat.runs.run import owned_files
-from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.sfm.captured_files import CAPTURE_RECORD_FILE
 from clsplat.version import package_version
 

@@ -23,13 +23,12 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.evaluation.held_out import Evaluation
 from clsplat.files.atomic import atomic_write
-from clsplat.files.documents import digest
+from clsplat.files.documents import digest, load_document
 from clsplat.images.video import video_missing
 from clsplat.progress import Progress
 from clsplat.report import REPORT_FILE_NAME
 from clsplat.report.page import write_report
 from clsplat.runs.run import Run
-from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.orientation.level import COLMAP_UP
 from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE

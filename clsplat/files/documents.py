@@ -171,3 +171,19 @@ def parse_json(text: str | bytes, *, once: bool = False) -> Any:
         return json.loads(text, object_pairs_hook=_unique_keys if once else None)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def load_document(path: Path, expected: str, key: str, limit: int = MAX_DOCUMENT_BYTES) -> dict[str, Any]:
+    """Load the JSON object in a file of at most `limit` bytes.
+
+    expected: the kind of file in words, for the error message.
+    key: a key that the object must have, for the error message; the caller checks it.
+    Raises InputError if the file cannot be read or has no JSON object.
+    """
+    try:
+        document = parse_json(read_document(path, expected, limit), once=True)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: is not a JSON object, expected one with {key}")
+    return document

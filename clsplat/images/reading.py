@@ -274,23 +274,24 @@ def open_photograph(path: Path) -> Any:
     head = _first_bytes(path)
     decoder = decoder_of(path, head)
     if decoder is None:
-        return in_srgb(open_image(path, wrong_contents(path, head)))
+        return in_srgb(open_image(path, head, wrong_contents(path, head)))
     source = decoder.open(path)
     _check_header(path, source.spec())
     return in_srgb(source)
 
 
-def open_image(path: Path, wrong: InputError | None = None) -> Any:
+def open_image(path: Path, head: bytes | None = None, wrong: InputError | None = None) -> Any:
     """Open an image and check its header. Returns OpenImageIO's input, which does not premultiply straight alpha.
 
     Images with data in their pixels, such as depth maps and STMaps, are opened by this function. `open_photograph` also
     opens formats that only cameras write.
 
+    head: first bytes of the file; None to read them.
     wrong: the error for a file that OpenImageIO cannot open; None for one with OpenImageIO's reason.
     Raises InputError if the file is missing, not an image, or has an implausible size.
     """
-    known, size = _first_bytes(path).startswith(IMAGE_SIGNATURES), path.stat().st_size
-    if size > MAX_UNSIGNED_IMAGE_BYTES and not known:
+    head, size = _first_bytes(path) if head is None else head, path.stat().st_size
+    if size > MAX_UNSIGNED_IMAGE_BYTES and not head.startswith(IMAGE_SIGNATURES):
         raise InputError(f"{path}: has {size} bytes that do not begin like an image, expected a picture")
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)

@@ -266,8 +266,8 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
 def _size_of(views: Mapping[str, dict[str, Any]]) -> float:
     """Return the distance of the farthest recorded camera from the cameras' middle, by which positions are compared.
 
-    So cameras far from the world's origin, as in a UTM zone, are told apart. If all cameras are in one place, their
-    largest coordinate is returned; 0 without cameras.
+    Positions far from the world's origin, as in a UTM zone, still differ relative to this distance. If all cameras are
+    at one position, the result is its largest coordinate. Without cameras it is 0.
     """
     if not views:
         return 0.0

@@ -12,7 +12,6 @@ import numpy as np
 from clsplat.arrays import Float64, numbers
 from clsplat.camera import Camera, Projection, focal_length
 from clsplat.errors import InputError
-from clsplat.files.documents import MAX_DOCUMENT_BYTES, parse_json, read_document
 from clsplat.scenes.dataset import MAX_COORDINATE, MAX_IMAGE_SIDE_PX
 
 EXPORT_AGAIN_ADVICE = "export the data set again or add the value"
@@ -95,24 +94,6 @@ def short(value: object) -> str:
         return repr(value)[:60]
     except ValueError:  # Python refuses to print an integer of thousands of digits
         return "a number of thousands of digits"
-
-
-def load_document(
-    path: Path, expected: str = "a transforms.json", key: str = "'frames'", limit: int = MAX_DOCUMENT_BYTES
-) -> dict[str, Any]:
-    """Load the JSON object in a file of at most `limit` bytes.
-
-    expected: the kind of file in words, for the error message.
-    key: a key that the object must have, for the error message; the caller checks it.
-    Raises InputError if the file cannot be read or has no JSON object.
-    """
-    try:
-        document = parse_json(read_document(path, expected, limit), once=True)
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: is not a JSON object, expected one with {key}")
-    return document
 
 
 def objects(document: dict[str, Any], key: str) -> list[dict[str, Any]]:

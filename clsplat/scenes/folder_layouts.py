@@ -15,10 +15,18 @@ from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file, open_input
 from clsplat.images.reading import companions, find_images
 from clsplat.scenes.dataset import DataSet, PosedImage
-from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_pictures, has_pictures, or_smaller
+from clsplat.scenes.photo_files import (
+    DOWNSCALED_FOLDER_FACTORS,
+    by_label,
+    called,
+    find_pictures,
+    has_pictures,
+    or_smaller,
+)
 from clsplat.scenes.photo_names import legible, match
 from clsplat.scenes.point_files import clouds_beside
 from clsplat.scenes.readers import colmap, transforms
+from clsplat.scenes.readers.scene_place import georeferenced
 from clsplat.scenes.readers.surveys.formats import SURVEY_FILES, check_names, survey_of
 from clsplat.scenes.sfm.video_frames import find_videos
 from clsplat.scenes.sidecar_files import inside
@@ -83,7 +91,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
 
     chosen: folder with the pictures, relative to `path`; None searches for it.
     missing: how many pictures may be missing, as for `find_pictures`.
-    Raises InputError if the model or its pictures cannot be read.
+    Raises InputError if the model, its pictures or its georeference.json cannot be read.
     """
     model_path = colmap.find_model(path)
     assert model_path is not None  # `detect` has checked this
@@ -97,6 +105,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
         if chosen is not None
         else [folder.with_name(f"{folder.name}_{factor}") for factor in DOWNSCALED_FOLDER_FACTORS]
     )
+    model = georeferenced(model, path, [model_path, path])
     return model, [candidate for candidate in smaller if candidate.is_dir()]
 
 
@@ -134,9 +143,7 @@ def _add_pictures(data: DataSet, folder: Path, listed_in: Path, missing: Missing
     if not present:
         raise InputError(f"{folder}: no images found, expected the {len(data.images)} images of {listed_in}")
     listed = [image.name for image in data.images]
-    # Of IMG.jpg and IMG.png the first one in alphabetical order is the photograph: the PNG may be a mask.
-    by_label = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(present)}
-    labelled = by_label if labels else {}
+    labelled = by_label(folder, present) if labels else {}
     exact = [labelled.get(name, folder / name) for name in listed]
     files = find_pictures(listed, exact, folder, listed_in, missing, present)
     names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]

@@ -30,7 +30,6 @@ from clsplat.scenes.dataset import DataSet, Lens, PosedImage, SceneFrame
 from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_survey, read_transforms
 from clsplat.scenes.orientation.new_frame import in_frame, new_frame
 from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
-from clsplat.scenes.readers.colmap import find_model
 from clsplat.scenes.readers.scene_place import georeference_by_gps, georeferenced
 from clsplat.scenes.scene import Scene, Split, View
 from clsplat.scenes.sfm.reconstruct import reconstruct
@@ -125,7 +124,7 @@ def load_scene_of(
     """Read a scene with the size, split, masks and lenses of a training's settings, as `load_scene` does.
 
     masks: the meaning of masks and alpha channels; None for that of the settings.
-    Other arguments, errors and warnings are those of `load_scene`.
+    For the other arguments, errors and warnings, see `load_scene`.
     """
     return load_scene(
         path,
@@ -202,7 +201,6 @@ def _read(
         folder = reconstruct(photos, folder, masks=for_sfm(masks), frames=frames, progress=progress)
         masks = after_sfm(masks, folder)
     data, smaller = read_colmap(folder, images, missing)
-    data = georeferenced(data, folder, [find_model(folder) or folder, folder])
     return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)
 
 

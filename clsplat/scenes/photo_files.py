@@ -26,6 +26,16 @@ If more pictures are missing, the folder may be the wrong one.
 """
 
 
+def by_label(folder: Path, present: Sequence[Path]) -> dict[str, Path]:
+    """Map labels to pictures. A label is a path below the folder without its extension.
+
+    Of IMG.jpg and IMG.png the first one in alphabetical order is the photograph, because the PNG may be a mask.
+
+    present: the pictures in `folder`, sorted.
+    """
+    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(present)}
+
+
 def find_pictures(
     listed: Sequence[str],
     exact: Sequence[Path | None],

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.errors import InputError
-from clsplat.files.documents import is_file, parse_json, read_document
+from clsplat.files.documents import is_file, load_document, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.models.codec.axes import NODE_SIMILARITY_TOLERANCE
 from clsplat.models.instances import IDENTITY_ROWS, Placement, Track, checked, grade, rows_of
 from clsplat.models.mesh import Mesh, read_mesh
-from clsplat.scenes.camera_json import Keys, load_document, objects, short
+from clsplat.scenes.camera_json import Keys, objects, short
 
 SHOT_VERSION_KEY, SHOT_VERSION = "clsplat_shot", 1
 EXPECTED_SHOT_FILE = f"a shot of several models (.json, with '{SHOT_VERSION_KEY}')"

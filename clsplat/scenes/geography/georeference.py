@@ -17,7 +17,7 @@ import numpy as np
 
 from clsplat.arrays import Float64, numbers
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.documents import is_file, parse_json, read_document
+from clsplat.files.documents import is_file, load_document
 
 GEOREFERENCE_FILE = "georeference.json"
 """Name of the record's file."""
@@ -26,7 +26,7 @@ MAX_GEOREFERENCE_BYTES = 1 << 20
 GEOCENTRIC_EPSG = 4978
 """EPSG code of WGS 84 geocentric coordinates (x, y, z in metres from the earth's centre)."""
 GEOGRAPHIC_EPSG_CODES = range(4000, 5000)
-"""EPSG codes whose coordinates are latitude and longitude in degrees, except for those of METRIC_EPSG_RANGES."""
+"""EPSG codes of systems with latitude and longitude in degrees. METRIC_EPSG_RANGES has the exceptions."""
 OTHER_GEOGRAPHIC_EPSG_CODES = (6318, 6668, 7844)
 """EPSG codes of further widely used systems in degrees: NAD83(2011), JGD2011 and GDA2020."""
 METRIC_EPSG_RANGES = (
@@ -162,17 +162,12 @@ def read_of_model(path: Path) -> Georeference | None:
 def read_georeference(path: Path) -> Georeference | None:
     """Read the record in the file `path`; None if there is no such file.
 
-    Only `epsg` is required. Without `origin` and `transform` the scene's coordinates are those of the reference system.
+    Only `epsg` is required. If the file has no `origin` and no `transform`, the scene uses the reference system itself.
     Raises InputError for a damaged file, and for a reference system in degrees.
     """
     if not is_file(path):
         return None
-    try:
-        document = parse_json(read_document(path, _EXPECTED_GEOREFERENCE, MAX_GEOREFERENCE_BYTES), once=True)
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON: {error}; expected {_EXPECTED_GEOREFERENCE}") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: is not a JSON object, expected one with 'epsg'")
+    document = load_document(path, _EXPECTED_GEOREFERENCE, "'epsg'", MAX_GEOREFERENCE_BYTES)
     origin, transform = (document.get(key) for key in ("origin", "transform"))
     place = np.zeros(3) if origin is None else numbers(origin)
     if place.shape != (3,) or not np.isfinite(place).all():

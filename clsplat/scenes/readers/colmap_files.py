@@ -140,8 +140,8 @@ def record_blocks(
 
     what: the kind of record, for messages.
     layout: the fixed part. item_bytes: number of bytes of an item.
-    whole: True if a block has the lists of all its records. False if lists are not needed: those that are not in the
-        block are skipped.
+    whole: True to put the complete list of each record into the block of the record. False to skip the rest of a list
+        that does not fit into the block.
     """
     head, length_at = layout.itemsize, COLMAP_COUNT.unpack_from
     number, kept, least = 0, b"", head

@@ -22,10 +22,10 @@ from clsplat.arrays import Float64, numbers
 from clsplat.camera import Camera, model_with, names_of
 from clsplat.config.training import Lenses, Missing
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.documents import is_file
+from clsplat.files.documents import is_file, load_document
 from clsplat.images.reading import IMAGE_SUFFIXES, image_size
 from clsplat.scenes.camera_checks import cameras_of
-from clsplat.scenes.camera_json import EXPORT_AGAIN_ADVICE, Keys, load_document, objects, short
+from clsplat.scenes.camera_json import EXPORT_AGAIN_ADVICE, Keys, objects, short
 from clsplat.scenes.dataset import (
     MAX_COORDINATE,
     DataSet,
@@ -70,7 +70,7 @@ def read_transforms(
     Warns of ignored keys and of contradictions. Raises InputError that names the file and the key for invalid JSON, for
     a key that is missing or has the wrong type, and for missing pictures.
     """
-    document = load_document(path, limit=MAX_TRANSFORMS_BYTES)
+    document = _document(path)
     readers = _readers(path, document)
     files = _pictures(path, readers, images, missing)
     there = [(keys, file) for keys, file in zip(readers, files, strict=True) if file is not None]
@@ -162,7 +162,7 @@ def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedIm
 
     size: (width, height) of missing pictures; needed if the file has no `w` and `h`.
     """
-    readers = _readers(path, load_document(path, limit=MAX_TRANSFORMS_BYTES))
+    readers = _readers(path, _document(path))
     with warnings.catch_warnings():  # no warnings of missing pictures: only names are needed
         warnings.simplefilter("ignore")
         try:
@@ -179,6 +179,10 @@ def _within(keys: Keys) -> Path:
     if not listed.isprintable():
         _inside(keys.path.parent, listed, keys.where)
     return _find_file(keys) if is_inside(keys.path.parent, listed) else keys.path.parent / _plain(listed)
+
+
+def _document(path: Path) -> dict[str, Any]:
+    return load_document(path, "a transforms.json", "'frames'", MAX_TRANSFORMS_BYTES)
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clsplat.errors import InputError
-from clsplat.files.documents import is_file, is_settings_of_run
+from clsplat.files.documents import is_file, is_settings_of_run, load_document
 from clsplat.images.reading import cannot_be_searched
-from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.video.frames import frame_sequences
 
 SFM_RECORD_FILE = "sfm.json"
@@ -21,7 +20,7 @@ CAPTURE_RECORD_FILE = "capture.json"
 """File in the output folder of a capture that records the call, and the input from which each stage's results were
 made."""
 RECORD_KEYS = {SFM_RECORD_FILE: "fingerprint", CAPTURE_RECORD_FILE: "made"}
-"""A key that each record has, by which it is told from another program's file of the same name."""
+"""For each record, a key that another program's file of the same name does not have."""
 
 
 @dataclass(frozen=True)

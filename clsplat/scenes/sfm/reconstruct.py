@@ -14,9 +14,8 @@ from clsplat.config.masks import MaskUse
 from clsplat.config.orientation import AS_IN_FILES, FrameUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import move_into_place, work_folder
-from clsplat.files.documents import is_file
+from clsplat.files.documents import is_file, load_document
 from clsplat.progress import Progress, no_progress
-from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE
 from clsplat.scenes.sfm import copies as sfm_copies

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import atomic_write, move_into_place, work_folder
-from clsplat.files.documents import is_file, known_digest
+from clsplat.files.documents import is_file, known_digest, load_document
 from clsplat.images.reading import find_images
 from clsplat.images.writing import write_spec
 from clsplat.progress import Progress, no_progress
-from clsplat.scenes.camera_json import load_document
 from clsplat.scenes.video.choice import Choice, choose
 from clsplat.scenes.video.colours import display_rgb
 from clsplat.scenes.video.motion import Measurements, Meter

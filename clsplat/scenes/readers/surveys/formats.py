@@ -23,6 +23,7 @@ from clsplat.scenes.readers.surveys.opensfm import (
     read_reconstruction,
 )
 from clsplat.scenes.readers.surveys.realityscan import XMP_FILES, find_xmp, read_xmp
+from clsplat.scenes.readers.surveys.values import centres_of
 
 MIN_SPREAD_DEGREES, MAX_SPREAD_DEGREES = 1e-5, 0.5
 """Least and largest extent, along x and y, of positions that may be degrees of longitude and latitude."""
@@ -115,7 +116,7 @@ def check_units(path: Path, images: Sequence[PosedImage]) -> None:
 
     path: the file of cameras, for the message.
     """
-    centres = np.stack([-image.rotation.T @ image.translation for image in images])
+    centres = centres_of(images)
     extent, middle = np.ptp(centres, axis=0), np.abs(np.median(centres, axis=0))
     across = float(extent[:2].max())
     on_globe = bool((np.abs(centres[:, 0]) <= 360).all() and (np.abs(centres[:, 1]) <= 90).all())

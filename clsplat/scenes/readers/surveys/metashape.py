@@ -35,7 +35,7 @@ from clsplat.scenes.geography.georeference import (
     place_of,
 )
 from clsplat.scenes.readers.surveys.lenses import UNDISTORTED_ADVICE, SurveyLens, model_of_kind, panorama
-from clsplat.scenes.readers.surveys.names import inner_name
+from clsplat.scenes.readers.surveys.values import centres_of, inner_name, numbers_in
 
 METASHAPE_HEAD_BYTES = 4096
 """Number of bytes at the beginning of an XML file by which Metashape's cameras are recognised."""
@@ -230,11 +230,8 @@ def _numbers(element: Element | None, where: str, count: int) -> Float64:
     where: file, part and element, for messages.
     """
     text = "" if element is None else element.text or ""
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.empty(0)
-    if values.shape != (count,) or not (np.abs(values) < MAX_COORDINATE).all():
+    values = numbers_in(text, count)
+    if values is None:
         found = "is missing" if element is None else f"is {short(text.strip())}"
         numbers = "a number" if count == 1 else f"{count} numbers"
         raise InputError(f"{where} {found}, expected {numbers}; export the cameras again")
@@ -312,7 +309,7 @@ def _on_earth(
 ) -> tuple[list[PosedImage], Georeference | None]:
     """Return the images and their georeference. Geocentric images are brought to a tangent plane; others stay."""
     system = (chunk.findtext("reference") or "").strip()
-    centres = np.stack([-image.rotation.T @ image.translation for image in images])
+    centres = centres_of(images)
     middle = np.median(centres, axis=0)
     is_local = system.upper().startswith(("LOCAL", "ENGCRS", "ENGINEERING"))
     if is_local or not EARTH_RADII[0] < np.linalg.norm(middle) < EARTH_RADII[1]:

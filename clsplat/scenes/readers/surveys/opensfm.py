@@ -21,7 +21,7 @@ from clsplat.scenes.camera_json import EXPORT_AGAIN_ADVICE, Keys, short
 from clsplat.scenes.dataset import MAX_COORDINATE, DataSet, Lens, PosedImage
 from clsplat.scenes.geography.georeference import Georeference, GpsResiduals, on_tangent_plane
 from clsplat.scenes.readers.surveys.lenses import SurveyLens, model_of_kind, panorama
-from clsplat.scenes.readers.surveys.names import inner_name
+from clsplat.scenes.readers.surveys.values import centres_of, inner_name
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 """Name of the file in OpenSfM's folder."""
@@ -188,7 +188,7 @@ def _georeference(
         return None
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise keys.wrong("latitude" if abs(latitude) > 90 else "longitude", "degrees on the earth")
-    centres = np.stack([-image.rotation.T @ image.translation for image in images])
+    centres = centres_of(images)
     away = float(np.linalg.norm(np.median(centres, axis=0)))
     if away > MAX_PLANE_METRES:
         warn(

@@ -26,8 +26,10 @@ from clsplat.files.documents import open_input
 from clsplat.files.xml_documents import read_xml
 from clsplat.images.reading import find_images, image_size
 from clsplat.scenes.camera_json import short
-from clsplat.scenes.dataset import MAX_COORDINATE, DataSet, Lens, PosedImage
+from clsplat.scenes.dataset import DataSet, Lens, PosedImage
+from clsplat.scenes.photo_files import by_label
 from clsplat.scenes.readers.surveys.lenses import UNDISTORTED_ADVICE, SurveyLens, model_of_kind
+from clsplat.scenes.readers.surveys.values import numbers_in
 
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 """Namespace of RealityScan's values."""
@@ -66,8 +68,7 @@ def read_xmp(folder: Path, photographs: Path | None) -> DataSet:
     there = photographs or folder
     present = find_images(there)
     files = {path.relative_to(there).as_posix(): path for path in present}  # IMG.jpg.xmp, then IMG.xmp
-    # Of IMG.jpg and IMG.png the first one in alphabetical order is the photograph: the PNG may be a mask.
-    files |= {path.relative_to(there).with_suffix("").as_posix(): path for path in reversed(present)}
+    files |= by_label(there, present)
     sizes = {camera.name: image_size(files[camera.name], orient=False) for camera in cameras if camera.name in files}
     if not sizes:
         names = examples(camera.name for camera in cameras)
@@ -125,11 +126,8 @@ class _Xmp:
         text = self.text(key)
         if text is None and default is not None:
             return np.full(count, default)
-        try:
-            values = np.array([float(word) for word in (text or "").split()])
-        except ValueError:
-            values = np.empty(0)
-        if values.shape != (count,) or not (np.abs(values) < MAX_COORDINATE).all():
+        values = numbers_in(text or "", count)
+        if values is None:
             found = f"has no xcr:{key}" if text is None else f"xcr:{key} is {short(text)}"
             numbers = "a number" if count == 1 else f"{count} numbers"
             raise InputError(f"{self.path}: {found}, expected {numbers}; export the XMP files again")
