@@ -136,8 +136,11 @@ def _percentiles(values: NDArray[Any]) -> dict[str, float]:
     return {f"p{percent}": float(value) for percent, value in zip(INFO_PERCENTILES, results, strict=True)}
 
 
-def text(info: dict[str, Any]) -> str:
-    """The result of `model_info` as text, with a line for each statistic."""
+def text(info: dict[str, Any], place: str | None = None) -> str:
+    """The result of `model_info` as text, with a line for each statistic.
+
+    place: description of the model's place on the earth; None if it is unknown.
+    """
 
     def numbers(values: list[float]) -> str:
         return " ".join(f"{value:.6g}" for value in values)
@@ -170,6 +173,8 @@ def text(info: dict[str, Any]) -> str:
         lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass filter"))
     if info.get("by_rays"):
         lines.append(("perspective", "drawn along rays, like a fisheye; other programs would show a haze"))
+    if place is not None:
+        lines.append(("on the earth", place))
     lines.append(("colour space", info["colorspace"]))
     lines += [("comment", line) for line in info.get("comments", [])]
     if info.get("ignored"):

@@ -6,6 +6,7 @@ Nothing is measured again. Missing or damaged files are reported as notes.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from clsplat.errors import InputError, plain
 from clsplat.files.documents import digest, parse_json, read_document
 from clsplat.gaussians import Gaussians, GaussiansOfFile
 from clsplat.runs.run import Run
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, read_georeference
 
 Record = dict[str, Any]
 
@@ -44,6 +46,7 @@ class RunNumbers:
     sessions: start, device, driver and versions of each training session.
     elapsed: wall time of all training sessions in seconds; None if unknown.
     model: description of model.ply, without its Gaussians.
+    place: reference system, origin and GPS residuals of the model's place on the earth; None if the place is unknown.
     histograms: edges and counts of each histogram, by name.
     notes: sentences on missing or damaged data, and other remarks.
     """
@@ -57,6 +60,7 @@ class RunNumbers:
     sessions: list[Record] = field(default_factory=list)
     elapsed: float | None = None
     model: Record | None = None
+    place: str | None = None
     histograms: dict[str, Record] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -120,6 +124,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
     _add_evaluation(numbers)
     if describe:
         _add_model(numbers, model)
+    _add_place(numbers)
     _add_contributions(numbers, records)
     _add_gate(numbers, records)
     iterations = run.config.iterations
@@ -270,6 +275,15 @@ def _add_model(numbers: RunNumbers, model: Gaussians | None) -> None:
         numbers.histograms[name] = _histogram(scales[:, axis], edges)
     opacities = 1 / (1 + np.exp(-np.clip(model.opacity_logits, -80, 80)))
     numbers.histograms["opacity"] = _histogram(opacities, np.linspace(0.0, 1.0, 41))
+
+
+def _add_place(numbers: RunNumbers) -> None:
+    try:
+        place = read_georeference(numbers.run.path / GEOREFERENCE_FILE)
+    except InputError as error:
+        numbers.notes.append(f"{str(error).removeprefix(f'{numbers.run.path}{os.sep}')}.")
+        return
+    numbers.place = None if place is None else place.summary
 
 
 def _histogram(values: NDArray[Any], edges: NDArray[np.float64]) -> Record:

@@ -390,6 +390,7 @@ def owned_files(path: Path) -> list[Path]:
         "test/**/*.png",
         "depth/**/*.png",
         "refined/*.txt",
+        f"refined/{GEOREFERENCE_FILE}",
         "cache/*.pixels",
         f"scratch/*{SCRATCH_SUFFIX}",
         "**/.*" + TEMPORARY_SUFFIX,

@@ -26,6 +26,7 @@ from clsplat.reference.render import render_grad
 from clsplat.report import page as report_page
 from clsplat.report import thumbnails
 from clsplat.runs.run import Run
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.loading import load_scene
 from clsplat.training import telemetry
 from clsplat.training.trainer import Trainer
@@ -131,6 +132,15 @@ def test_settings_that_differ_are_listed_by_themselves(reported: Path) -> None:
     every = {row.all("td")[0].words: row.attributes.get("class") for row in rows_of(root, "settings")}
     assert {name for name, kind in every.items() if kind == "differs"} == set(changed)
     assert every["--seed"] is None
+
+
+def test_the_place_on_the_earth_is_listed(copied: Path) -> None:
+    """The reference system and the origin; of a damaged record, what is wrong with it."""
+    record = copied / GEOREFERENCE_FILE
+    record.write_text('{"epsg": 32632, "origin": [500000.5, 5.25e6, 100]}')
+    assert "EPSG:32632, origin 500000.5, 5250000, 100" in report(copied)
+    record.write_text('{"epsg": 4326}')
+    assert "georeference.json: EPSG:4326 counts in degrees" in notes(report(copied))
 
 
 def test_it_says_where_and_with_what(reported: Path, default_device: Device) -> None:

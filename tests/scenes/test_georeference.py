@@ -191,6 +191,20 @@ def test_converted_models_get_it(tmp_path: Path, capsys: Capture) -> None:
     assert read_of_model(further) is None
 
 
+def test_info_says_where_a_model_lies(tmp_path: Path, capsys: Capture) -> None:
+    """The record as JSON, and in text the place in degrees with the distances from GPS positions."""
+    model = tmp_path / "model.ply"
+    random_gaussians(3).save(model)
+    assert json.loads(printed(capsys, ["info", model, "--json"]).out)["georeference"] is None
+    place = on_tangent_plane((48.137, 11.575, 519.0), "a note", GpsResiduals(7, 1.25, 3.5))
+    (tmp_path / GEOREFERENCE_FILE).write_bytes(place.content())
+    assert json.loads(printed(capsys, ["info", model, "--json"]).out)["georeference"] == place.document()
+    (line,) = (line for line in printed(capsys, ["info", model]).out.splitlines() if line.startswith("on the earth"))
+    assert "EPSG:4978, origin 4177" in line
+    assert "(latitude 48.1370000, longitude 11.5750000, altitude 519.00 m)" in line
+    assert line.endswith("GPS of 7 photographs: rms 1.25 m, at most 3.5 m")
+
+
 def test_a_mirrored_model_gets_no_place(tmp_path: Path, capsys: Capture) -> None:
     """A record with a mirror would be refused when it is read."""
     source, target = tmp_path / "model.ply", tmp_path / "mirrored.ply"

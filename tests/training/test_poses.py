@@ -22,6 +22,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.runs.appearance import held_out_looks
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, Georeference
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.cameras.export import doubt_poses
@@ -94,7 +95,8 @@ def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> Non
 def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:
     """refined/ is a COLMAP model of the same pictures: training views have moved, but for two, and held-out ones and
     the points as they have on average."""
-    run = trained_run(scene, CONFIG, default_device, tmp_path / "run")
+    placed = replace(scene, georeference=Georeference(32632))
+    run = trained_run(placed, CONFIG, default_device, tmp_path / "run")
     result = json.loads(run.eval_path.read_text())
     assert result["mean"]["psnr_aligned"] >= result["mean"]["psnr"] - 0.05  # the loss is not the PSNR alone
     again = load_scene(
@@ -110,9 +112,10 @@ def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Devi
         same = np.allclose(found.rotation, wanted.rotation, atol=1e-9)
         assert same == (view.split == "test" or view.name in (scene.train_views[0].name, _second(scene)))
         assert (found.fx, found.cx) == (view.camera.fx, view.camera.cx)
-    assert set(run.refined_path.iterdir()) <= {
-        run.refined_path / f"{stem}.txt" for stem in ("cameras", "images", "points3D")
-    }
+    names = {"cameras.txt", "images.txt", "points3D.txt", GEOREFERENCE_FILE}
+    assert {path.name for path in run.refined_path.iterdir()} == names
+    assert again.georeference is not None
+    assert again.georeference.epsg == 32632
 
 
 def test_a_call_that_is_refused_leaves_the_run_as_it_is(folder: Path, tmp_path: Path, capfd: Capture) -> None:

@@ -99,6 +99,18 @@ class Georeference:
         transform = self.transform @ back[:3, :3]
         return replace(self, origin=self.origin + self.transform @ back[:3, 3], transform=transform)
 
+    @property
+    def summary(self) -> str:
+        """The reference system, the origin and the distances from GPS positions, as text on one line."""
+        place = ", ".join(f"{value:.12g}" for value in self.origin)
+        text = f"EPSG:{self.epsg}, origin {place}"
+        if self.epsg == GEOCENTRIC_EPSG:
+            latitude, longitude, altitude = place_of(self.origin)
+            text += f" (latitude {latitude:.7f}, longitude {longitude:.7f}, altitude {altitude:.2f} m)"
+        if (known := self.residuals) is not None:
+            text += f"; GPS of {known.count:,} photographs: rms {known.rms:.3g} m, at most {known.largest:.3g} m"
+        return text
+
     def document(self) -> dict[str, Any]:
         """Return the content of georeference.json."""
         known = self.residuals

@@ -7,7 +7,9 @@ import warnings
 from collections.abc import Mapping
 
 from clsplat.errors import examples
+from clsplat.files.atomic import atomic_write
 from clsplat.runs.run import Run
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.readers.colmap_writer import write_model
 from clsplat.scenes.scene import Scene
 from clsplat.training.cameras.intrinsics import RefinedLenses
@@ -32,6 +34,8 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
     cameras |= {view.name: camera for view, camera in zip(scene.train_views, poses.cameras, strict=True)}
     images = [(view.name, lenses.refined(view.lens), cameras[view.name]) for view in scene.views]
     write_model(run.refined_path, images, points, scene.point_colors)
+    if scene.georeference is not None:
+        atomic_write(run.refined_path / GEOREFERENCE_FILE, scene.georeference.content())
     degrees, shifts = poses.motions()
     far = (degrees > POSE_WARNING_DEGREES) | (shifts > POSE_WARNING_UNITS * scene.length_unit)
     if far.any():
