@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 import pytest
 
@@ -66,3 +67,44 @@ def test_the_global_mapper_gives_no_others(
     assert [each.num_reg_images() for each in found.values()] == ([left] if left else [])
     if left:
         assert pycolmap.Reconstruction(tmp_path / "out" / "0").num_reg_images() == left, "it is written again"
+
+
+@pytest.fixture
+def located(tmp_path: Path) -> tuple[Path, pycolmap.Reconstruction]:
+    """A database with matches and GPS positions, of which two are 1 km off, and the true model in metres."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
+    options.num_points3D, options.prior_position = 150, True
+    options.prior_position_coordinate_system = pycolmap.PosePriorCoordinateSystem.WGS84
+    pycolmap.set_random_seed(0)
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        model = pycolmap.synthesize_dataset(options, opened)
+        for prior in opened.read_all_pose_priors()[3:5]:
+            prior.position = prior.position + np.array([1000 / 111_195, 0, 0])  # metres in a degree of latitude
+            opened.update_pose_prior(prior)
+        without = opened.read_all_pose_priors()[0]
+        without.position = np.array([*without.position[:2], np.nan])
+        opened.update_pose_prior(without)
+    return tmp_path / "database.db", model
+
+
+@pytest.mark.parametrize("by_gps", [True, False])
+def test_gps_holds_the_cameras_in_metres(
+    by_gps: bool, located: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    """Also with a position without an altitude and two that are far off. Without GPS the scale is pycolmap's own."""
+    database, true = located
+    models = mapping.incremental_models(
+        database, tmp_path, tmp_path / "sparse", threads=1, seed=0, relaxed=False, by_gps=by_gps, placed=lambda: None
+    )
+    (found,) = models.values()
+    assert found.num_reg_images() == 12
+    sizes = [
+        np.linalg.norm(
+            model.find_image_with_name("camera000001_frame000001.png").projection_center()
+            - model.find_image_with_name("camera000001_frame000002.png").projection_center()
+        )
+        for model in (found, true)
+    ]
+    # The robust loss still lets the two positions pull the cameras, which are only 10 m apart: 2 % were seen.
+    assert (abs(sizes[0] / sizes[1] - 1) < 0.05) == by_gps

@@ -38,6 +38,11 @@ matched wrongly, once in about 70 reconstructions on a busy machine. Matches are
 """
 GLOBAL_FOLDER = "sparse-global"
 """Folder in the worker's folder for the models of the global mapper."""
+MIN_GPS_PRIOR_PHOTOS = 200
+"""Number of photographs from which GPS positions hold the cameras, if pairs are chosen by them too.
+
+Long strips of photographs drift without them. The cameras of fewer photographs hardly change, but take twice the time.
+"""
 MIN_PLACED_FRACTION = 0.6
 """Fraction of the photographs below which mapping is repeated in another way."""
 
@@ -55,7 +60,7 @@ class Worker:
         self.photos, self.work = Path(task["photos"]), Path(task["work"])
         self.database = self.work / "database.db"
         self.count = sum(map(len, task["groups"]))
-        self.placed = 0
+        self.placed, self.by_gps = 0, False
         self.seconds: dict[str, dict[str, float]] = {}
         self._stage, self._began = "", (0.0, 0.0)
 
@@ -94,6 +99,7 @@ class Worker:
         given = focal_lengths.from_exif(self.database)
         try:
             chosen, pairs = self.match()
+            self.by_gps = chosen == "spatial" and self.count >= MIN_GPS_PRIOR_PHOTOS
         except matching.NoPositionsError as error:
             self.say(refused=str(error))
             return
@@ -189,6 +195,7 @@ class Worker:
             threads=self.reproducible_threads,
             seed=self.task["seed"],
             relaxed=relaxed,
+            by_gps=self.by_gps,
             placed=self.count_one,
         )
 

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 GPS_ALTITUDE_M = 0.0
 """Altitude in metres at which horizontal positions are computed. EXIF's altitudes are often wrong by 100 m."""
 
+GPS_MAP_SIGMA_M, GPS_ALTITUDE_SIGMA_M = 5.0, 50.0
+"""Standard deviations in metres of GPS positions on the map, and of their altitudes, as priors of the cameras."""
+
 
 def renumber_by_name(database: Path) -> None:
     """Renumber the database's images, frames, cameras and rigs in the order of the images' names.
@@ -125,6 +128,21 @@ def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
     if len(known):
         metres[known] = pycolmap.GPSTransform().ellipsoid_to_enu(degrees[known], *degrees[known[0]])[:, :2]
     return metres
+
+
+def weight_gps(database: Path) -> None:
+    """Give the GPS positions the standard deviations above, and those without an altitude the median of the others."""
+    with pycolmap.Database.open(database) as opened:
+        system = pycolmap.PosePriorCoordinateSystem.WGS84
+        priors = [prior for prior in opened.read_all_pose_priors() if prior.coordinate_system == system]
+        altitudes = [prior.position[2] for prior in priors if np.isfinite(prior.position[2])]
+        usual = statistics.median(altitudes) if altitudes else GPS_ALTITUDE_M
+        for prior in priors:
+            latitude, longitude, altitude = prior.position
+            prior.position = np.array([latitude, longitude, altitude if np.isfinite(altitude) else usual])
+            deviations = np.array([GPS_MAP_SIGMA_M, GPS_MAP_SIGMA_M, GPS_ALTITUDE_SIGMA_M])
+            prior.position_covariance = np.diag(deviations**2)
+            opened.update_pose_prior(prior)
 
 
 def feature_evidence(database: Path) -> dict[str, Any]:

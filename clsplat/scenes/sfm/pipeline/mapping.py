@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pycolmap
 
+from clsplat.scenes.sfm.pipeline.database import weight_gps
+
 MIN_MODEL_PHOTOS = 3
 """Minimum number of photographs in a model."""
 MIN_SHOWN_POINTS = 15
@@ -25,12 +27,21 @@ Models = dict[Path, pycolmap.Reconstruction]
 
 
 def incremental_models(
-    database: Path, photos: Path, output: Path, *, threads: int, seed: int, relaxed: bool, placed: Callable[[], None]
+    database: Path,
+    photos: Path,
+    output: Path,
+    *,
+    threads: int,
+    seed: int,
+    relaxed: bool,
+    by_gps: bool,
+    placed: Callable[[], None],
 ) -> Models:
     """Recover models by adding one photograph after another.
 
     photos: folder of the photographs. output: folder for the models, which is made.
     relaxed: accept smaller triangulation angles and fewer matches than by default.
+    by_gps: hold the cameras near their GPS positions, except for those that are far off. The model is in metres then.
     placed: function that is called after each photograph that is added to the first two.
     """
     options = pycolmap.IncrementalPipelineOptions()
@@ -41,6 +52,9 @@ def incremental_models(
     options.ba_global_max_refinements, options.ba_local_max_refinements = GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS
     # Poses are adjusted with enough points to cover every photograph, then the other points with these poses.
     options.mapper.ba_global_ignore_redundant_points3D = True
+    if by_gps:
+        weight_gps(database)
+        options.use_prior_position = options.use_robust_loss_on_prior_position = True
     if relaxed:
         options.mapper.init_min_tri_angle = 4.0
         options.mapper.init_max_forward_motion = 1.0
