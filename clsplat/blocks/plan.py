@@ -28,11 +28,13 @@ PLAN_FORM = 1
 """Form of plan.json that this version writes, and the only one that it reads."""
 MARGIN = 0.2
 """Width that widens a cell on each side, as a fraction of the cell's size along the same axis."""
-SHARE = 0.02
-"""Fraction of a photograph's pixels from which on the photograph belongs to a block."""
+SHARE = 0.25
+"""Least pixels of a photograph that a cell fills if the photograph belongs to the cell's block, as a fraction of the
+pixels that the photograph's fullest cell fills (docs/scale.md)."""
 _EXPECTED_PLAN = "a plan that clsplat blocks plan wrote"
 Pair = tuple[float, float]
 Point = tuple[float, float, float]
+Axes = tuple[Point, Point]
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Block:
     name: two numbers, such as "0_1", which are also the name of the block's folder.
     cell: the block's part of the ground. The cells of all blocks cover the plane without overlap.
     widened: the cell and its margin, within which the block's Gaussians are trained.
-    photographs: names of the training views that show the widened cell, sorted.
+    photographs: names of the training views that belong to the block, sorted.
     iterations: number of training steps.
     gaussians: number of the coarse model's Gaussians in the widened cell.
     """
@@ -95,14 +97,16 @@ class BlockPlan:
     scene_digest: digest of the scene record of the coarse model's run.
     finish_steps: number of steps over all photographs after the merge.
     blocks: in the order in which the merge joins them.
-    joined: for each cell that was joined to a neighbour, the reason in words.
+    joined: for each cell that was joined to its neighbours, the reason in words.
+    photographs: number of the scene's training views.
+    gaussians: number of the coarse model's Gaussians.
     """
 
     scene: Path
     settings: TrainConfig
     division: Division
     up: Point
-    axes: tuple[Point, Point]
+    axes: Axes
     margin: float
     share: float
     coarse: str
@@ -110,6 +114,8 @@ class BlockPlan:
     finish_steps: int
     blocks: tuple[Block, ...]
     joined: tuple[str, ...] = ()
+    photographs: int = 0
+    gaussians: int = 0
 
     @property
     def digest(self) -> str:
@@ -145,6 +151,8 @@ class BlockPlan:
             "share": self.share,
             "finish_steps": self.finish_steps,
             "joined": list(self.joined),
+            "photographs": self.photographs,
+            "gaussians": self.gaussians,
             "train": table_of(self.settings),
             "blocks": [
                 {
@@ -200,6 +208,8 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
         finish_steps=_count(document["finish_steps"]),
         blocks=tuple(_block_of(block) for block in document["blocks"]),
         joined=tuple(_text(line) for line in document["joined"]),
+        photographs=_count(document["photographs"]),
+        gaussians=_count(document["gaussians"]),
     )
     names = [block.name for block in plan.blocks]
     if not names or len(set(names)) < len(names):
