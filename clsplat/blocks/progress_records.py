@@ -78,7 +78,10 @@ def done_record(run: Path) -> DoneRecord | None:
     return DoneRecord(*map(str, texts))
 
 
-def is_done(run: Path, plan: str) -> bool:
-    """True if the training in the folder `run` has finished by this plan. plan: as for `DoneRecord`."""
+def is_done(run: Path, plan: str, start: str | None = None) -> bool:
+    """True if the training in the folder `run` has finished by this plan, and with this start unless it is None.
+
+    plan, start: as for `DoneRecord`.
+    """
     record = done_record(run)
-    return record is not None and record.plan == plan
+    return record is not None and record.plan == plan and start in (None, record.start)
