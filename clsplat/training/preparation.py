@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.chunks.store import ChunkStore
+from clsplat.config.points import SCENE_POINTS_ONLY
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.images.alpha import background_colour
@@ -24,24 +25,26 @@ from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.point_cloud import is_colourless, photographed, with_points
 from clsplat.stages.device_gaussians import KINDS, HostGaussians, SavedArray, host_model, saved_models
 from clsplat.training.cameras.refinement import check_refinable
+from clsplat.training.start import NO_START, Start
 
 
-def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> Scene:
+def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None, start: Start = NO_START) -> Scene:
     """Scene with its length unit, start points and known depths; `scene` itself if it has them already.
 
     resumed: the run that continues, which keeps its length unit.
+    start: what the training begins with. With a model, it needs no points beyond the scene's.
     Raises InputError if training with its points, depths or refined cameras would fail.
     """
     scene.require_training_views()
     check_refinable(config, scene.train_views)
-    start = config.start_points
-    is_prepared = bool(start) and scene.start == start
-    if not len(scene.points) and not start.sky:  # the length unit is computed from these points
-        scene = with_points(scene, start)
+    points = config.start_points if start.model is None else SCENE_POINTS_ONLY
+    is_prepared = bool(points) and scene.start == points
+    if not len(scene.points) and not points.sky:  # the length unit is computed from these points
+        scene = with_points(scene, points)
     unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:
         scene = replace(scene, unit=unit)
-    scene = with_points(scene, start)
+    scene = with_points(scene, points)
     return with_depths(scene, config.depth_use)
 
 
@@ -79,15 +82,16 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
         raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more steps")
 
 
-def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
+def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool, start: Start = NO_START) -> Scene:
     """Prepare the scene, and record it and the settings in the run if there is one. Returns the scene to train on.
 
     Unless training continues from a checkpoint, also warn of faults that `sanity_checks.of_scene` finds, and give
     points without colours the photographs' colours.
+    start: what the training begins with.
 
     Raises InputError without `resume` if the run has been trained already, and with `resume` if its scene was another.
     """
-    scene = prepared(scene, config, run if resume else None)
+    scene = prepared(scene, config, run if resume else None, start)
     if run is not None:
         if not resume and (run.checkpoints() or run.read_metrics()):
             raise InputError(
@@ -102,7 +106,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
             return scene
     for text in sanity_checks.of_scene(scene, config.background):
         warnings.warn(text)
-    if is_colourless(scene):
+    if start.model is None and is_colourless(scene):
         warnings.warn(f"{scene.name}: the points have no colours, and get their colours from the photographs")
         scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
     return scene

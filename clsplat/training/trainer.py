@@ -37,6 +37,7 @@ from clsplat.training.mip_filter import MipFilter
 from clsplat.training.preparation import saved_model
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
+from clsplat.training.start import Start
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
@@ -74,7 +75,7 @@ class Trainer:
         scene: Scene,
         config: TrainConfig,
         device: Device,
-        initial: Gaussians | None = None,
+        initial: Gaussians | Start | None = None,
         strategy: Callable[[TrainConfig], Strategy] = strategy_of,
         further: Sequence[Device] = (),
         memory: HostMemory = UNLIMITED,
@@ -92,7 +93,7 @@ class Trainer:
         self.planner = MemoryPlanner(scene, config, self.rasterizer, self.photographs, memory, self.batch)
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.array(background_colour(config.background), np.float32)
-        self.given = initial
+        self.begins_with = initial if isinstance(initial, Start) else Start(initial)
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
         self.pending.on &= self.batch is None and not config.refines  # batches and refinement wait for each step
@@ -105,9 +106,10 @@ class Trainer:
         self.tried: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
         self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
-        make = partial(from_scene, self.scene, self.config.random_points, self.position.rng)
-        initial = make() if self.given is None else self.given
+        initial = self.begins_with.model or from_scene(self.scene, self.config.random_points, self.position.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
+        if (earlier := self.begins_with.appearance_of) is not None:
+            self.appearance.begin_from(earlier, fixed=not self.begins_with.trains_appearance)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near = initial.origin, self.scene.near
         asked = self.config.perspective
