@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ class TrainedRegion:
 
     axes: (2, 3), two horizontal directions in world coordinates. The dot products have the unit of low and high.
     low, high: (2,), edges along the axes; -inf and inf for no edge.
+    Kernels and `numbers` expect a region in the coordinates of the model's means (`relative_to`).
     """
 
     axes: Float64
@@ -50,11 +51,17 @@ class TrainedRegion:
 
         origin: world coordinates of the means' origin (`Gaussians.origin`).
         """
-        low, high = self.edges(origin)
-        found = self.coordinates(means)
+        local, found = self.relative_to(origin), self.coordinates(means)
+        low, high = local.low.astype(np.float32), local.high.astype(np.float32)
         return np.asarray(((low <= found) & (found < high)).all(axis=1))
 
-    def edges(self, origin: Sequence[float] | Float64 = (0.0, 0.0, 0.0)) -> tuple[Float32, Float32]:
-        """`low` and `high` relative to an origin in world coordinates, rounded from float64 to float32."""
+    def relative_to(self, origin: Sequence[float] | Float64) -> TrainedRegion:
+        """The same region for means that are relative to `origin`, in world coordinates."""
         shift = self.axes @ np.asarray(origin, np.float64)
-        return (self.low - shift).astype(np.float32), (self.high - shift).astype(np.float32)
+        return replace(self, low=self.low - shift, high=self.high - shift)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Arguments of the kernels (REGION_PARAMETERS in kernels/shared/region.h): axis, low and high of each axis."""
+        rows = np.concatenate([self.axes, self.low[:, None], self.high[:, None]], axis=1).astype(np.float32)
+        return tuple(float(number) for number in rows.ravel())

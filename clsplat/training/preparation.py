@@ -5,7 +5,7 @@ the Gaussians of a checkpoint."""
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.depth_sources import length_unit_of, with_depths
-from clsplat.scenes.scene import Scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.start.point_cloud import is_colourless, photographed, with_points
 from clsplat.stages.device_gaussians import KINDS, HostGaussians, SavedArray, host_model, saved_models
 from clsplat.training.cameras.refinement import check_refinable
@@ -71,6 +71,12 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
         f"{scene.extent:.4g}; if they were relative to {unit:.4g} when the training began, start a new training"
     )
     return None
+
+
+def is_along_rays(config: TrainConfig, views: Sequence[View]) -> bool:
+    """True if a model is trained along the rays of pixels: if the settings ask for it, or if some view needs it."""
+    asked = config.perspective
+    return asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in views))
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:

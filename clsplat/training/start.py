@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.optimisation.trained_region import TrainedRegion
+from clsplat.runs.checkpoints import Checkpoint, unusable
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,3 +70,32 @@ def check_start(start: Start, config: TrainConfig) -> None:
     if not len(model) or (region is not None and not region.contains(model.means, model.origin).any()):
         place = "" if region is None else " in the region"
         raise InputError(f"start: the model of {len(model):,} Gaussians has none{place}, expected at least one")
+
+
+def region_state(region: TrainedRegion | None) -> dict[str, Any]:
+    """Return the JSON state that a checkpoint has for the region of the training; empty without one."""
+    if region is None:
+        return {}
+    edges = [[None if np.isinf(edge) else edge for edge in side.tolist()] for side in (region.low, region.high)]
+    return {"region": {"axes": region.axes.tolist(), "low": edges[0], "high": edges[1]}}
+
+
+def region_of(state: Mapping[str, Any] | None) -> TrainedRegion | None:
+    """Return the region of the JSON state that `region_state` has under "region"; None for None."""
+    if state is None:
+        return None
+    low, high = (
+        [end if edge is None else edge for edge in state[side]] for side, end in (("low", -inf), ("high", inf))
+    )
+    return TrainedRegion(np.array(state["axes"]), np.array(low), np.array(high))
+
+
+def check_region(checkpoint: Checkpoint, region: TrainedRegion | None) -> None:
+    """Raise InputError if a checkpoint was written with another region than `region`."""
+    saved, now = checkpoint.state.get("region"), region_state(region).get("region")
+    if saved != now:
+        raise unusable(
+            checkpoint,
+            f"it was written with the region {saved or 'of the whole scene'}, and now the region is "
+            f"{now or 'the whole scene'}: continue with the command that began the training",
+        )
