@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import suppress
@@ -41,7 +42,7 @@ class AttemptProcess:
         with suppress(ValueError, TypeError, IndexError):
             return Outcome(**json.loads(lines[-1]))
         reason = lines[-1] if lines else f"the process was ended with status {status}"
-        return Outcome(self.attempt.name, "lost", status, reason)
+        return Outcome(self.attempt.name, "lost", status, reason, socket.gethostname())
 
     def ask_to_end(self) -> None:
         """Ask the command to end, as by SIGTERM. Does not wait."""

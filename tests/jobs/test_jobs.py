@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from calls import refuses
 from counting import counted, counting_task
-from systems import posix
+from systems import alive, posix
 
 from clsplat.errors import ClsplatError
 from clsplat.files.locks import claim
@@ -190,15 +190,6 @@ def test_the_end_of_the_dispatcher_ends_the_commands(tmp_path: Path, number: sig
     tasks = [counting_task(tmp_path, name, before[int(name)] + 2) for name in "01"]
     run_tasks(tasks, LocalEngine(2), tmp_path / "jobs")
     assert [counted(tmp_path, name) for name in "01"] == [count + 2 for count in before]
-
-
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    stat = Path(f"/proc/{pid}/stat")
-    return not (stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z")
 
 
 def test_what_makes_a_worker_unfit(tmp_path: Path) -> None:

@@ -229,7 +229,10 @@ _NO_PYTHON_ADVICE = (
 
 
 def python_module(module: str, *words: str) -> list[str]:
-    """Return `clsplat.process.module_command` of these words. Raises DriverError if Python does not know the path of its executable."""
+    """Return the result of `clsplat.process.module_command`.
+
+    Raises DriverError if Python does not know the path of its executable.
+    """
     if not sys.executable:  # it is empty in a program that embeds Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
     return module_command(module, *words)
