@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsplat.blocks.plan import COARSE_FOLDER, PLAN_FILE, BlockPlan, read_plan
+from clsplat.blocks.ground import ground_of
+from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE, BlockPlan, Division, Point, read_plan
+from clsplat.blocks.progress_records import CITY_FILES
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import known_digest
 from clsplat.runs import scene_record
-from clsplat.runs.run import Run
+from clsplat.runs.run import Run, check_output, is_run
 from clsplat.runs.settings import table_of
 from clsplat.scenes.scene import Scene
 from clsplat.training.preparation import prepared
@@ -53,11 +55,75 @@ def check_plan(
     return plan
 
 
-def settings_differences(planned: TrainConfig, now: TrainConfig) -> list[str]:
-    """Return a text for each setting that shapes the model and differs, such as "seed is 0 in the plan and 1 now"."""
+def check_new_plan(city: Path) -> None:
+    """Raise InputError if a plan cannot be made in the folder `city`, because the folder is used for something else."""
+    of_city = any((city / name).exists() for name in (PLAN_FILE, COARSE_FOLDER))
+    if is_run(city) and not of_city:
+        raise InputError(f"{city}: is a run, but not of blocks; expected a new folder, or one with a plan")
+    check_output(city, resume=is_run(city), overwrite=False, beside=CITY_FILES)
+
+
+def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Division, up: Point | None) -> BlockPlan | None:
+    """Return the plan in a city's folder if it was made for this scene with these options.
+
+    division, up: the options of the division; None for an up direction that is estimated.
+    Returns None if there is no plan, or one with another division by which no block has begun. Raises InputError like
+    `check_plan`, and for another division if a block has begun.
+    """
+    if not (city / PLAN_FILE).exists():
+        return None
+    plan = check_plan(city, scene, config)
+    now = ground_of(scene, up).up
+    changed = [
+        f"{flag} is {was} in the plan and {given} now"
+        for flag, was, given in (
+            ("--blocks", plan.division.blocks, division.blocks),
+            ("--block-mem", plan.division.memory, division.memory),
+            ("--block-photographs", plan.division.photographs, division.photographs),
+            ("--up", plan.up, now),
+        )
+        if was != given
+    ]
+    if not changed:
+        return plan
+    if (city / BLOCKS_FOLDER).exists():
+        raise InputError(
+            f"{city / PLAN_FILE}: was made with other options: {examples(changed)}; expected the same, as blocks have "
+            f"been trained by the plan; move {city / BLOCKS_FOLDER} away, or give a new folder"
+        )
+    return None
+
+
+def check_coarse(coarse: Run, wanted: TrainConfig, scene: Scene, config: TrainConfig) -> bool:
+    """Check that the coarse model is trained on a scene with the wanted settings. Returns True if it is finished.
+
+    wanted: settings for the training of the coarse model.
+    scene, config: the scene at the size of the whole, and the settings of the whole.
+    Raises InputError that lists the differences.
+    """
+    wanted = replace(wanted, batch=coarse.config.batch)  # the number of devices may have changed
+    if changed := settings_differences(coarse.config, wanted, "for the coarse model"):
+        raise InputError(
+            f"{coarse.config_path}: has other settings: {examples(changed)}; expected the same, or a new folder for a "
+            "new plan"
+        )
+    finished = coarse.model_path.exists() and coarse.model_record().get("step") == coarse.config.iterations
+    if finished and (changed := scene_differences(coarse, scene, config)):
+        raise InputError(
+            f"{coarse.path}: was trained on another scene than {scene.source or scene.name} is now: "
+            f"{'; '.join(changed)}; expected the same views and photographs, or a new folder for a new plan"
+        )
+    return finished
+
+
+def settings_differences(planned: TrainConfig, now: TrainConfig, where: str = "in the plan") -> list[str]:
+    """Return a text for each setting that shapes the model and differs, such as "seed is 0 in the plan and 1 now".
+
+    where: place of the earlier settings, for the text.
+    """
     was, given = _flat(table_of(planned)), _flat(table_of(now))
     return [
-        f"{name.replace('_', '-')} is {was[name]} in the plan and {given[name]} now"
+        f"{name.replace('_', '-')} is {was[name]} {where} and {given[name]} now"
         for name in was
         if was[name] != given[name] and name not in OF_NO_MODEL
     ]

@@ -10,12 +10,14 @@ import numpy as np
 
 from clsplat.blocks.coarse import block_steps, finish_steps
 from clsplat.blocks.measurement import CellLoads, LoadMeasurement
-from clsplat.blocks.plan import MARGIN, SHARE, Block, BlockPlan, Division
+from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Division
 from clsplat.blocks.split import MAX_BLOCKS, Leaf, Tree, balanced, cells, cut_again, gridded, parse_blocks, without
+from clsplat.camera import Camera
 from clsplat.errors import InputError, amount, examples
 from clsplat.files.documents import known_digest
 from clsplat.runs import scene_record
-from clsplat.runs.run import Run
+from clsplat.runs.run import Run, is_run
+from clsplat.scenes.scene import Scene
 
 MIN_CAMERA_PLACES = 2
 """Least number of different camera positions of a block."""
@@ -55,6 +57,19 @@ def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division:
         photographs=len(photographs),
         gaussians=len(measurement.model),
     )
+
+
+def coarse_run(city: Path) -> Run | None:
+    """Return the run of the coarse model in a city's folder; None if it has not begun."""
+    folder = city / COARSE_FOLDER
+    return Run.open(folder) if is_run(folder) else None
+
+
+def coarse_cameras(coarse: Run, scene: Scene) -> list[Camera]:
+    """Return the cameras of a scene's training views at the size of the coarse model's photographs."""
+    record = scene_record.read(coarse)
+    sizes = {} if record is None else {name: view["size"] for name, view in record["views"].items()}
+    return [view.camera.resized(*sizes[view.name]) if view.name in sizes else view.camera for view in scene.train_views]
 
 
 def _divided(measurement: LoadMeasurement, division: Division) -> Tree:
