@@ -89,8 +89,6 @@ def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses) -> N
 
     message = "the scheduler was lost; what is done stays, and the same command goes on when a scheduler runs again"
     refuses(f"--scheduler {cluster.address}: {message}", run, error=ClsplatError)
-    for name in ("a", "b"):
-        cluster.kill(name)
     pids = [int((tmp_path / f"{task.name}.pid").read_text()) for task in tasks]
     until = time.monotonic() + 60
     while any(map(alive, pids)) and time.monotonic() < until:
