@@ -21,6 +21,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.training.loop import Between, StepReport, TrainingSession
 from clsplat.training.memory import HostMemory
 from clsplat.training.preparation import begin, check_scene, settings_of
+from clsplat.training.start import NO_START, Start, check_start
 from clsplat.training.trainer import Trainer
 
 
@@ -47,6 +48,7 @@ def train(
     scratch: str | Path | None = None,
     run: Run | None = None,
     resume: bool = False,
+    start: Start = NO_START,
     on_step: Callable[[StepReport], None] | None = None,
     on_plan: Callable[[Plan], None] | None = None,
     between: Between | None = None,
@@ -77,6 +79,9 @@ def train(
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
         Continue from the run's latest checkpoint. If False, a run that has checkpoints or metrics is refused.
+    start : Start
+        What to begin with in place of Gaussians from the scene's points: a model, the region in which it is trained,
+        and another run's appearance. To resume, give the same start again.
     on_step : callable, optional
         Called with a report every 10 steps (`REPORT_EVERY` in `clsplat/training/loop.py`).
     on_plan : callable, optional
@@ -106,12 +111,14 @@ def train(
     """
     check_scene(scene)
     config = settings_of(config, run, resume=resume)
+    check_start(start, config)
     with nullcontext() if run is None else locked(run.path, "train"):
         first, *further = _opened(device, parse_bytes(max_device_mem))
         config = config.on_devices(1 + len(further), explicit=resume)
         memory = HostMemory.chosen(max_host_mem, cache, run, scratch)
         memory.remove_scratch()
-        trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further, memory=memory)
+        scene = begin(scene, config, run, resume=resume, start=start)
+        trainer = Trainer(scene, config, first, start, further=further, memory=memory)
         with closing(trainer):
             session = TrainingSession(trainer, run, on_step, on_plan)
             if resume:

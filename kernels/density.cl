@@ -10,6 +10,7 @@
 #include "shared/math.h"
 #include "shared/splat.h"
 #include "shared/chunks.h"
+#include "shared/region.h"
 #ifdef RAYS
 #include "shared/lanes.h"
 #include "shared/rays.h"
@@ -69,13 +70,22 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
 // Computes scores for densification. seen (n): numbers of views; whole_largest, current_largest (n): the largest
 // contribution to a view in the last complete epoch and in the current one -> scores (n): USELESS if neither is over
 // contribution_edge; else the mean gradient norm, if it is over gradient_edge; else UNWANTED. A mean that is not finite
-// counts as 0.
+// counts as 0. With REGION and means (n, 3): FROZEN outside the region.
 __kernel void density_scores(const uint n, const float gradient_edge, const float contribution_edge,
                              __global const float *gradient_sums, __global const float *seen,
                              __global const float *whole_largest, __global const float *current_largest,
-                             __global float *scores) {
+#ifdef REGION
+                             __global const float *means,
+#endif
+                             __global float *scores REGION_PARAMETERS) {
   const size_t i = get_global_id(0);
   if (i >= n) return;
+#ifdef REGION
+  if (!in_region(means + 3 * i REGION_NUMBERS)) {
+    scores[i] = FROZEN;
+    return;
+  }
+#endif
   const float mean = gradient_sums[i] / (seen[i] < 1.0f ? 1.0f : seen[i]);
   const float gradient = fabs(mean) < INFINITY ? mean : 0.0f;
   const bool wanted = gradient > gradient_edge;
@@ -86,7 +96,8 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
 // Marks the Gaussians that remain, that are cloned and that are split, by the thresholds of MarkRules
 // (clsplat/optimisation/density_rules.py). Gaussian i is row first + i of the model. scores, radii, logits (n);
 // log_scales (n, 3); cut_off, cut_off_row: a Gaussian may be cloned or split if its score is above cut_off, or if its
-// score equals cut_off and its row is at most cut_off_row -> marks (3, n), 0 or 1: remains, is cloned, is split.
+// score equals cut_off and its row is at most cut_off_row -> marks (3, n), 0 or 1: remains, is cloned, is split. With
+// REGION a Gaussian whose score is FROZEN remains.
 __kernel void density_marks(const uint n, const uint first, const float cut_off, const uint cut_off_row,
                             const float large_edge, const float transparent_edge, const float oversized_edge,
                             const float oversized_half_edge, const float radius_edge, __global const float *scores,
@@ -100,7 +111,11 @@ __kernel void density_marks(const uint n, const uint first, const float cut_off,
   const bool wanted = score >= 0.0f && (score > cut_off || (score == cut_off && first + i <= cut_off_row));
   const bool large = largest > large_edge, gone = score == USELESS || logits[i] <= transparent_edge;
   const bool stays = !gone && !(largest > oversized_edge);
+#ifdef REGION
+  marks[i] = score == FROZEN || (stays && !(wanted && large) && !(radii[i] > radius_edge));
+#else
   marks[i] = stays && !(wanted && large) && !(radii[i] > radius_edge);
+#endif
   marks[(size_t)n + i] = stays && wanted && !large;
   marks[2 * (size_t)n + i] = !gone && wanted && large && !(largest > oversized_half_edge);
 }

@@ -8,12 +8,13 @@
 //   amount: a factor of the noise, in 1 / world units. dead: opacity at which half of the noise is added. highest:
 //     Gaussians with this logit or more do not move.
 //   readback (READBACK_SIZE): after a stopped pass (duplicate.cl) nothing changes.
-//   -> means (n, 3): in world units.
+//   -> means (n, 3): in world units. With REGION (shared/region.h) means outside the region stay.
 // Equations: docs/gradients.md, (92) and (93).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/random.h"
+#include "shared/region.h"
 
 #define HALVES 8              // number of uniform 16-bit numbers that are summed
 #define WORDS (HALVES / 2)    // number of random 32-bit words, each with two of these numbers
@@ -34,11 +35,14 @@ static inline float normal(uint row_word, uint index) {
 __kernel void add_noise(const uint n, const uint first_row, const uint key0, const uint key1, const float amount,
                         const float dead, const float highest, const float limit2, __global const uint *readback,
                         __global const float *quaternions, __global const float *log_scales,
-                        __global const float *opacity_logits, __global float *means) {
+                        __global const float *opacity_logits, __global float *means REGION_PARAMETERS) {
   const uint i = get_global_id(0);
   if (i >= n || readback[READBACK_STOPPED]) return;
   const float logit = opacity_logits[i];
   if (!(logit < highest)) return;
+#ifdef REGION
+  if (!in_region(means + 3 * (size_t)i REGION_NUMBERS)) return;
+#endif
   const uint row_word = mixed((first_row + i) ^ key0) + key1;
   const float e0 = normal(row_word, 0), e1 = normal(row_word, 1), e2 = normal(row_word, 2);
   const float by = amount * sigmoidL(100.0f * (dead - sigmoidL(logit)));

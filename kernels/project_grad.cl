@@ -13,6 +13,7 @@
 //   by_lens (n, 4), with LENS: each Gaussian's gradient with respect to the logs of the focal lengths and, per pixel,
 //     to the principal point.
 //   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians.
+//   With REGION (shared/region.h) visible Gaussians outside the region have gradients of zero.
 //   PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2), with the opacity o and the scales
 //     s_k.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
@@ -29,6 +30,7 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 #include "shared/chunks.h"
+#include "shared/region.h"
 #ifdef RAYS
 #include "shared/rays.h"
 #include "shared/tangent.h"
@@ -84,14 +86,14 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
                            ,
                            __global float *by_lens
 #endif
-                               PENALTY_PARAMETERS) {
+                               PENALTY_PARAMETERS REGION_PARAMETERS) {
   const uint first_row = get_global_id(0) * LANES;
   if (first_row >= n) return;
   int shown[LANES];
   Gradients d;
   if (!gradients_of(n, first_row, coefficients, camera, tile_counts, first_slots, slots, splats, means, quaternions,
                     log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
-                    d_sh_rest + (size_t)3 * (coefficients - 1) * first_row, shown, &d PENALTY_WEIGHTS))
+                    d_sh_rest + (size_t)3 * (coefficients - 1) * first_row, shown, &d PENALTY_WEIGHTS REGION_NUMBERS))
     return;
   for (uint lane = 0; lane < LANES; ++lane) {
     const size_t i = first_row + lane;
@@ -187,7 +189,7 @@ __kernel void project_step(
     ,
     __global float *contributions
 #endif
-        PENALTY_PARAMETERS,
+        PENALTY_PARAMETERS REGION_PARAMETERS,
     const float beta1, const float beta2, const float epsilon, const float root, const float root_sh_rest,
     const float rate_means, const float rate_quaternions, const float rate_log_scales, const float rate_opacity_logits,
     const float rate_sh_dc, const float rate_sh_rest, const float limit2, const float limit2_sh,
@@ -229,7 +231,7 @@ __kernel void project_step(
     int *seen = shown + block * LANES;
     const int any = gradients_of(end, begin + block * LANES, coefficients, camera, tile_counts, first_slots, slots,
                                  splats, means, quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
-                                 by_sh_rest + block * LANES * sh_width, seen, &d PENALTY_WEIGHTS);
+                                 by_sh_rest + block * LANES * sh_width, seen, &d PENALTY_WEIGHTS REGION_NUMBERS);
     for (uint lane = 0; lane < LANES; ++lane) {
       const uint i = block * LANES + lane;
       const int one = any && seen[lane];
@@ -301,7 +303,7 @@ __kernel void project_step(
   if (me < rows)
     any = gradients_of(end, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
                        quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, own_sh_rest, shown,
-                       &d PENALTY_WEIGHTS);
+                       &d PENALTY_WEIGHTS REGION_NUMBERS);
   UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;
   UNROLL for (int k = 0; k < 4; ++k) by_quaternion[4 * me + k] = any ? d.quaternion[k].all : 0.0f;
   UNROLL for (int k = 0; k < 3; ++k) by_log_scale[3 * me + k] = any ? d.scale[k].all : 0.0f;

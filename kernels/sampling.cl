@@ -6,7 +6,7 @@
 // Buffers: cameras (views, CAMERA_SIZE): each as in project.cl, all of one camera model.
 //   means (n, 3).
 //   -> least (n): natural log of the smallest standard deviation that the pictures resolve, in world units. With
-//     `more`, a smaller value that is already stored stays.
+//     `more`, a smaller value that is already stored stays. With REGION there is no limit outside the region.
 //   limit_scales: log_scales (n, 3) below `least` are raised to `least`.
 // Equations: docs/gradients.md, (88).
 #include "shared/math.h"
@@ -15,6 +15,7 @@
 #define CAMERA_SPACE __global const
 #define NEEDS_PIXEL_WIDTH
 #include "shared/camera.h"
+#include "shared/region.h"
 
 #define UNSEEN -1e30f          // log scale of a Gaussian that no camera sees: no limit
 #define SAMPLING 0.4472135901f // smallest standard deviation in pixel widths, sqrt(0.2)
@@ -30,9 +31,15 @@ static inline float width_at(float x, float y, float z, __global const float *ca
 }
 
 __kernel void sampling_limits(const uint n, const uint views, const uint more, __global const float *cameras,
-                              __global const float *means, __global float *least) {
+                              __global const float *means, __global float *least REGION_PARAMETERS) {
   const uint i = get_global_id(0);
   if (i >= n) return;
+#ifdef REGION
+  if (!in_region(means + 3 * (size_t)i REGION_NUMBERS)) {
+    least[i] = UNSEEN;
+    return;
+  }
+#endif
   const float x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
   float nearest = 1e30f;
   for (uint view = 0; view < views; ++view) {

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from clsplat.config.pictures import HOLDOUT_SURFACE_FIELDS
-from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
+from clsplat.optimisation.density_rules import FRESH, FROZEN, UNWANTED, USELESS
 
 TILE = 16  # tile_size in gsplat
 """Tile size: side of a tile in pixels (Kerbl et al. 2023, section 6)."""
@@ -205,6 +205,7 @@ def header() -> str:
     lines += [f"#define POSE_ROWS {POSE_ROWS}u", f"#define SUM_ROWS {SUM_ROWS}u"]
     lines.append(f"#define CHUNK_ROWS {CHUNK_ROWS}u")
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
+    lines.append(f"#define FROZEN {FROZEN}f")
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}
     layouts |= {"DEEP": DEEP_SLICE, "HELD": HOLDOUT_SURFACE_FIELDS, "EWA": EWA_CAMERA, "BY_CAMERA": EWA_GRADIENT}
     for prefix, fields in layouts.items():

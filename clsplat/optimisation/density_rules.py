@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32
+from clsplat.optimisation.trained_region import TrainedRegion
 
 FRESH = np.uint32(1 << 31)
 """Bit of an entry in a list of a model's rows. It marks the row as a new Gaussian, whose moments start at zero."""
-UNWANTED, USELESS = -1.0, -2.0
-"""Scores that mark Gaussians: never densify (UNWANTED); prune, because they contribute too little (USELESS)."""
+UNWANTED, USELESS, FROZEN = -1.0, -2.0, -3.0
+"""Scores that mark Gaussians: never densify (UNWANTED); prune, because they contribute too little (USELESS); neither
+densify nor prune, because they are outside the region of the training (FROZEN)."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class MarkRules:
 
     cut_off: (value, row). A Gaussian passes if its score is over `value`, or equals `value` and its
         row is at most `row`.
+    region: the region in which the rules hold, in the coordinates of the means; None for everywhere. Gaussians outside
+        it stay as they are.
     """
 
     gradient: float = inf
@@ -48,6 +52,7 @@ class MarkRules:
     oversized_half: float = inf
     radius: float = inf
     contribution: float = -inf
+    region: TrainedRegion | None = None
 
 
 def edge(holds: Callable[[Float32], Any]) -> float:

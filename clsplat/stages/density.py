@@ -24,6 +24,7 @@ from clsplat.optimisation.density_rules import FRESH, MarkRules
 from clsplat.stages.chunk_pool import ChunkPool, StoredArray
 from clsplat.stages.device_gaussians import AnyArray, AnyGaussians, DeviceGaussians, HostArray, HostGaussians
 from clsplat.stages.project import Projected, Screen
+from clsplat.stages.region import region_build
 from clsplat.stages.scan import scan
 
 SCORED_STATISTICS = ("whole_largest", "current_largest")
@@ -311,19 +312,23 @@ _COLUMN_WIDTHS = {"log_scales": 3}
 
 @stage("density")
 def _scored(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> _Scratch:
-    n, arrays, scratch = stop - start, marker.statistics.named(), _Scratch(marker, stop - start)
-    columns = {name: scratch.column(name, arrays[name], start) for name in _COLUMNS if name in arrays}
+    n, gathered, scratch = stop - start, marker.statistics.named(), _Scratch(marker, stop - start)
+    columns = {name: scratch.column(name, gathered[name], start) for name in _COLUMNS if name in gathered}
     views = (columns["gradient_sums"], columns["seen"])
     known = [columns.get(name, columns["seen"]) for name in SCORED_STATISTICS]
-    edges = (rules.gradient, rules.contribution)
-    launch_items(device, device.kernels("density").density_scores, n, n, *edges, *views, *known, scratch.scores)
+    defines, bounds = region_build(rules.region)
+    # The log scales' memory is free until the scores have been computed.
+    means = [scratch.column("log_scales", marker.parameters["means"], start)] if bounds else []
+    arrays, edges = (*views, *known, *means, scratch.scores), (rules.gradient, rules.contribution)
+    launch_items(device, device.kernels("density", defines).density_scores, n, n, *edges, *arrays, *bounds)
     return scratch
 
 
 @stage("density")
 def _listed(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> DeviceRowList:
     """Return the row list that the rules give for the old rows [start, stop). The next call overwrites it."""
-    n, model, kernels = stop - start, marker.parameters, device.kernels("density")
+    n, model, (defines, _) = stop - start, marker.parameters, region_build(rules.region)
+    kernels = device.kernels("density", defines)
     scratch, counts = _scored(device, marker, rules, start, stop), allocate(device, (2,), np.uint32)
     columns = [scratch.column(name, model[name], start) for name in ("log_scales", "opacity_logits")]
     # The scores have been computed, so the memory of `seen` is free.

@@ -360,9 +360,18 @@ def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, value
     array.set(changed)
 
 
-def change_rows(array: AnyArray, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-    """Replace the rows of an array by the results of `change(rows)`, for all rows at once or chunk by chunk."""
-    if isinstance(array, StoredArray):
+def change_rows(
+    array: AnyArray,
+    change: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    only: NDArray[np.uint32] | None = None,
+) -> None:
+    """Replace the rows of an array by the results of `change(rows)`, for all rows at once or chunk by chunk.
+
+    only: (k,), the rows to replace; None for all.
+    """
+    if only is not None:
+        set_rows_at(array, only, change(rows_at(array, only)))
+    elif isinstance(array, StoredArray):
         array.change(change)
     else:
         array.set(change(array.get()))

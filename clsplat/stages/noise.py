@@ -14,7 +14,9 @@ from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.step_noise import Exploration
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.region import region_build
 
 NOISE_OPACITY_RANGE = 0.16
 """Width of the range of opacities above `Exploration.dead` in which noise is added. Above it, noise would be less than
@@ -37,27 +39,39 @@ def noise_numbers(explore: Exploration) -> tuple[float, ...]:
 
 
 def noise(
-    device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
+    device: Device,
+    explore: Exploration,
+    gaussians: DeviceGaussians,
+    first_row: int,
+    readback: DeviceArray,
+    region: TrainedRegion | None = None,
 ) -> None:
     """Add a step's noise to the means. Nothing changes if `readback` says that the step's pass has stopped.
 
     gaussians: all Gaussians of the model, or consecutive rows of it.
     first_row: the model's row that is the first of `gaussians`.
+    region: the region in which means move, in their coordinates; None for everywhere.
     """
     if explore.amount != 0:
-        _add_noise(device, explore, gaussians, first_row, readback)
+        _add_noise(device, explore, gaussians, first_row, readback, region)
 
 
 @stage("noise", add_noise=1)
 def _add_noise(
-    device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
+    device: Device,
+    explore: Exploration,
+    gaussians: DeviceGaussians,
+    first_row: int,
+    readback: DeviceArray,
+    region: TrainedRegion | None,
 ) -> None:
     """Launch add_noise. A separate function, so that the profile of a step without noise has no stage `noise`."""
     *words, amount = noise_numbers(explore)
+    defines, bounds = region_build(region)
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,
-        device.kernels("noise", {"LANES": 1}).add_noise,
+        device.kernels("noise", {"LANES": 1, **defines}).add_noise,
         gaussians.count,
         gaussians.count,
         np.uint32(first_row),
@@ -65,4 +79,5 @@ def _add_noise(
         *(amount, explore.dead, highest, limit2),
         readback.buffer,
         *(gaussians[group] for group in ("quaternions", "log_scales", "opacity_logits", "means")),
+        *bounds,
     )

@@ -20,10 +20,12 @@ from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.optimisation.dropout import Thinning
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, chunk_parts, parts
+from clsplat.stages.region import region_build
 
 CPU_STEP_ROWS = 128
 """Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
@@ -225,6 +227,7 @@ def project_grad(
     sh_rest: bool = True,
     explore: Exploration = NO_EXPLORATION,
     by_lens: DeviceArray | None = None,
+    region: TrainedRegion | None = None,
 ) -> None:
     """Compute `gradients` and `screen` of the visible Gaussians from the slots of their pairs.
 
@@ -234,11 +237,14 @@ def project_grad(
     explore: penalties on opacity and scale, whose gradients are added.
     by_lens: (n, 4), filled with each Gaussian's gradient with respect to the logs of the focal lengths and to the
     principal point in pixels, for a camera with an image plane.
+    region: the region in which Gaussians get gradients, in the coordinates of the means; None for everywhere. Visible
+    Gaussians outside it get zeros.
     """
+    in_region, bounds = region_build(region)
     weights, build = explore.weights, _build(device)
     defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
     defines |= {"PENALTIES": True} if weights else {}
-    defines |= {} if by_lens is None else {"LENS": True}
+    defines |= in_region | ({} if by_lens is None else {"LENS": True})
     n = gaussians.count
     launch_items(
         device,
@@ -251,6 +257,7 @@ def project_grad(
         *([screen.contributions] if slots.fields.contributions else []),
         *([] if by_lens is None else [by_lens]),
         *weights,
+        *bounds,
     )
 
 
@@ -281,6 +288,7 @@ def project_step(
     readback: DeviceArray,
     *,
     explore: Exploration = NO_EXPLORATION,
+    region: TrainedRegion | None = None,
 ) -> None:
     """Do the work of `project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
@@ -298,12 +306,14 @@ def project_step(
     weights = len(explore.weights)
     if weights:
         defines["PENALTIES"] = True
+    in_region, bounds = region_build(region)
     arguments = (
         n,
         *_inputs(parameters, camera_array, projected, slots),
         screen.gradients,
         *([screen.contributions] if slots.fields.contributions else []),
         *numbers[:weights],
+        *bounds,
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
@@ -312,7 +322,7 @@ def project_step(
         *projected.chunk_arguments,
     )
     build = _build(device)
-    defines |= build.defines
+    defines |= build.defines | in_region
     if build.lanes > 1:
         kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
         launch_groups(device, kernel, -(-n // CPU_STEP_ROWS), 1, *arguments)

@@ -9,8 +9,10 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.stages.device_camera import UploadedCameras
 from clsplat.stages.device_gaussians import AnyGaussians, parts
+from clsplat.stages.region import region_build
 
 SAMPLING_GAUSSIAN_BYTES = 4
 """Bytes per Gaussian for the lower limit of its scales."""
@@ -18,7 +20,12 @@ SAMPLING_GAUSSIAN_BYTES = 4
 
 @stage("sampling")
 def sampling_limits(
-    device: Device, work: Workspace, gaussians: AnyGaussians, cameras: Sequence[UploadedCameras], least: DeviceArray
+    device: Device,
+    work: Workspace,
+    gaussians: AnyGaussians,
+    cameras: Sequence[UploadedCameras],
+    least: DeviceArray,
+    region: TrainedRegion | None = None,
 ) -> None:
     """Fill `least` (n,) with the natural log of the smallest standard deviation, in world units, that the photographs
     resolve.
@@ -26,12 +33,17 @@ def sampling_limits(
     See Yu et al. 2024, Mip-Splatting, section 5.1. A Gaussian that no camera sees gets -1e30.
 
     cameras: the cameras of all photographs, from `upload_cameras`.
+    region: the region in which scales have limits, in the coordinates of the means; None for everywhere. Gaussians
+    outside it get -1e30.
     """
+    defines, bounds = region_build(region)
     for start, stop, (part,) in parts(work, gaussians):
         for index, group in enumerate(cameras):
-            kernel = device.kernels("sampling", {"LANES": 1, **group.model.defines}).sampling_limits
+            kernel = device.kernels("sampling", {"LANES": 1, **group.model.defines, **defines}).sampling_limits
             arrays = (group.values, part["means"], least.rows(start, stop))
-            launch_items(device, kernel, part.count, part.count, group.values.shape[0], int(index > 0), *arrays)
+            launch_items(
+                device, kernel, part.count, part.count, group.values.shape[0], int(index > 0), *arrays, *bounds
+            )
 
 
 @stage("sampling", limit_scales=1)

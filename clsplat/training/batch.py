@@ -114,7 +114,7 @@ class _AddedView(GradientStep):
         if self.device.only_tries:
             models = (parameters, sums, rows.gradients, rows.gradients)
             adam(self.device, step, *models, readback=self.rasterizer.readback)
-            noise(self.device, self.noise, parameters, rows.start, self.rasterizer.readback)
+            noise(self.device, self.noise, parameters, rows.start, self.rasterizer.readback, self.region)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +231,7 @@ class Replica:
         room = view_gradients(self.rasterizer.work, parameters)
         shares = tuple(part.on(self.device, each) for part, each in zip(inputs.parts, values, strict=True))
         own: list[NDArray[Any] | None] = []
-        view = _RemoteView(*settings, arrays, gradients, own, explore=step.explore)
+        view = _RemoteView(*settings, arrays, gradients, own, explore=step.explore, region=step.region)
         here = replace(inputs, photograph=photograph, parts=shares)
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
@@ -308,7 +308,7 @@ class Batch:
         own: dict[int, Sequence[DeviceArray | None]] = {}
         explore = step.explore.scaled(sqrt(batch))
         settings = (device, self.rasterizer, config, number, rates, step.fields, own, explore)
-        step_of_view = _AddedView(*settings, explore=step.explore.of_view())
+        step_of_view = _AddedView(*settings, explore=step.explore.of_view(), region=step.region)
         adam_step = step_of_view.adam_step
         first, *others = shares(len(views), 1 + len(self.replicas))
         transfers = self._send(model[0])
@@ -332,7 +332,7 @@ class Batch:
         for start, _, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
             models = (parameters, gradients, moments, squares)
             adam(device, adam_step, *models, readback=self.rasterizer.readback)
-            noise(device, explore, parameters, start, self.rasterizer.readback)
+            noise(device, explore, parameters, start, self.rasterizer.readback, step.region)
         for inputs in views:
             for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
                 part.update(gradient, self.rasterizer.readback)

@@ -436,7 +436,8 @@ def _tell_of_limit(trainer: Trainer) -> None:
     """Warn if --density.max-gaussians has limited the growth of --density.growth paper, unless training began above
     the limit."""
     density, scene = trainer.config.density, trainer.scene
-    most, began = GROWTH_LIMIT_FRACTION * density.max_gaussians, len(scene.points) or trainer.config.random_points
+    given, most = trainer.begins_with.model, GROWTH_LIMIT_FRACTION * density.max_gaussians
+    began = (len(scene.points) or trainer.config.random_points) if given is None else len(given)
     if not density.fills and began < most <= trainer.parameters.count:
         warnings.warn(
             f"--density.max-gaussians {density.max_gaussians:,} has limited the growth: --density.growth mcmc, or "
@@ -474,5 +475,6 @@ def _tell_idle_settings(trainer: Trainer) -> None:
     if trainer.step == 0 and config.density.every and count > config.density.max_gaussians:
         warnings.warn(
             f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
-            f"{config.density.max_gaussians:,}, which limits only their growth: give the scene fewer points"
+            f"{config.density.max_gaussians:,}, which limits only their growth"
+            + (": give the scene fewer points" if trainer.begins_with.model is None else "")
         )

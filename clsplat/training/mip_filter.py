@@ -13,6 +13,7 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.stages.device_camera import upload_cameras
 from clsplat.stages.device_gaussians import AnyGaussians, HostArray
 from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampling_limits
@@ -24,10 +25,20 @@ SAMPLING_LIMIT_INTERVAL_STEPS = 100
 
 class MipFilter(Component):
     """Lower limits of the Gaussians' scales, from the training cameras at full picture size. Inactive unless the
-    settings ask for antialiasing."""
+    settings ask for antialiasing.
 
-    def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
-        self._device, self._work, self._antialiased = device, work, config.antialiased
+    region: the region in which scales have limits, in the coordinates of the means; None for everywhere.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        device: Device,
+        work: Workspace,
+        cameras: Sequence[Camera],
+        region: TrainedRegion | None = None,
+    ) -> None:
+        self._device, self._work, self._antialiased, self._region = device, work, config.antialiased, region
         self._least: DeviceArray | None = None  # (n,), lower limits; None until the next step computes them
         if not self.on:
             return
@@ -54,7 +65,7 @@ class MipFilter(Component):
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Compute the scales' lower limits, and raise scales that are below them."""
         self._least = allocate(self._device, (gaussians.count,), np.float32)
-        sampling_limits(self._device, self._work, gaussians, self._cameras, self._least)
+        sampling_limits(self._device, self._work, gaussians, self._cameras, self._least, self._region)
         self.after_adam(gaussians)
 
     def after_adam(self, gaussians: AnyGaussians) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a model after density control: their order in space, and the halves of split Gaussians."""
+"""Rows of a model after density control: their order in space, halves of split Gaussians, and rows outside a region."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from clsplat.arrays import Float32
 from clsplat.chunks.gathering import NewValues, SourceList, row_entries
 from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
 from clsplat.device.buffers import DeviceArray
+from clsplat.errors import ClsplatError
 from clsplat.optimisation.density_rules import FRESH
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.stages.density import DeviceRowList, new_values
-from clsplat.stages.device_gaussians import AnyGaussians, rows_at, set_rows_at
+from clsplat.stages.device_gaussians import AnyArray, AnyGaussians, rows_at, set_rows_at
+from clsplat.stages.region import rows_inside
 from clsplat.training.density import RowPlan
 
 Places = NDArray[np.integer[Any]] | slice
@@ -148,3 +151,16 @@ def some_of(places: Places, begin: int, count: int) -> Places:
     if isinstance(places, slice):
         return slice(places.start + begin, min(places.start + begin + count, places.stop))
     return places[begin : begin + count]
+
+
+def drop_outside(means: AnyArray, region: TrainedRegion | None) -> RowPlan | None:
+    """Plan to drop the Gaussians outside the region of a training; None if there are none.
+
+    means: (n, 3). region: in their coordinates; None for everywhere.
+    """
+    if region is None:
+        return None
+    rows = rows_inside(means, region)
+    if not len(rows):
+        raise ClsplatError("no Gaussian is left in the region of the training; lower --density.min-opacity")
+    return None if len(rows) == means.shape[0] else RowPlan(rows=rows)

@@ -5,13 +5,14 @@ the Gaussians of a checkpoint."""
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from clsplat.chunks.store import ChunkStore
+from clsplat.config.points import SCENE_POINTS_ONLY
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.images.alpha import background_colour
@@ -20,28 +21,30 @@ from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.depth_sources import length_unit_of, with_depths
-from clsplat.scenes.scene import Scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.start.point_cloud import is_colourless, photographed, with_points
 from clsplat.stages.device_gaussians import KINDS, HostGaussians, SavedArray, host_model, saved_models
 from clsplat.training.cameras.refinement import check_refinable
+from clsplat.training.start import NO_START, Start
 
 
-def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> Scene:
+def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None, start: Start = NO_START) -> Scene:
     """Scene with its length unit, start points and known depths; `scene` itself if it has them already.
 
     resumed: the run that continues, which keeps its length unit.
+    start: what the training begins with. With a model, it needs no points beyond the scene's.
     Raises InputError if training with its points, depths or refined cameras would fail.
     """
     scene.require_training_views()
     check_refinable(config, scene.train_views)
-    start = config.start_points
-    is_prepared = bool(start) and scene.start == start
-    if not len(scene.points) and not start.sky:  # the length unit is computed from these points
-        scene = with_points(scene, start)
+    points = config.start_points if start.model is None else SCENE_POINTS_ONLY
+    is_prepared = bool(points) and scene.start == points
+    if not len(scene.points) and not points.sky:  # the length unit is computed from these points
+        scene = with_points(scene, points)
     unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:
         scene = replace(scene, unit=unit)
-    scene = with_points(scene, start)
+    scene = with_points(scene, points)
     return with_depths(scene, config.depth_use)
 
 
@@ -70,6 +73,12 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
     return None
 
 
+def is_along_rays(config: TrainConfig, views: Sequence[View]) -> bool:
+    """True if a model is trained along the rays of pixels: if the settings ask for it, or if some view needs it."""
+    asked = config.perspective
+    return asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in views))
+
+
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
     """Raise InputError if a run has a checkpoint after the last step of `config`.
 
@@ -79,15 +88,16 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
         raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more steps")
 
 
-def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
+def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool, start: Start = NO_START) -> Scene:
     """Prepare the scene, and record it and the settings in the run if there is one. Returns the scene to train on.
 
     Unless training continues from a checkpoint, also warn of faults that `sanity_checks.of_scene` finds, and give
     points without colours the photographs' colours.
+    start: what the training begins with.
 
     Raises InputError without `resume` if the run has been trained already, and with `resume` if its scene was another.
     """
-    scene = prepared(scene, config, run if resume else None)
+    scene = prepared(scene, config, run if resume else None, start)
     if run is not None:
         if not resume and (run.checkpoints() or run.read_metrics()):
             raise InputError(
@@ -102,7 +112,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
             return scene
     for text in sanity_checks.of_scene(scene, config.background):
         warnings.warn(text)
-    if is_colourless(scene):
+    if start.model is None and is_colourless(scene):
         warnings.warn(f"{scene.name}: the points have no colours, and get their colours from the photographs")
         scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
     return scene

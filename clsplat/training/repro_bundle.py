@@ -31,6 +31,7 @@ from clsplat.device.selection import open_device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import REFUSED, SPLAT
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.runs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from clsplat.runs.settings import config_text, parse_config
@@ -49,6 +50,7 @@ from clsplat.stages.loss_terms import DepthTerm
 from clsplat.stages.project import Slots
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.stability.health import Incident, finite_or_zero
+from clsplat.training.start import region_of, region_state
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields
 from clsplat.training.step.inputs import StepRows, ViewInputs
 from clsplat.training.supervision.image_cache import kept_pixels
@@ -83,6 +85,7 @@ class StepRecord(TypedDict):
     settings: text of config.toml.
     versions, device: software versions and device of the machine that trained.
     depth_factor: factor of the depth loss (`DepthTerm`), if there is one.
+    region: the region of the training in the coordinates of the Gaussians' means, if it has one.
     of: (number of Gaussians in the bundle, number in the training).
     reproduced: True if the bundle reproduces the non-finite values.
     """
@@ -97,6 +100,7 @@ class StepRecord(TypedDict):
     versions: dict[str, str]
     device: dict[str, str]
     depth_factor: NotRequired[float]
+    region: NotRequired[dict[str, Any]]
     of: NotRequired[tuple[int, int]]
     reproduced: NotRequired[bool]
 
@@ -106,12 +110,14 @@ class Bundle:
     """Training step with everything that a replay needs.
 
     models: parameters and moments, with the keys "parameters", "first" and "second".
+    region: the region of the training, in the coordinates of the means; None for everywhere.
     """
 
     record: StepRecord
     config: TrainConfig
     inputs: ViewInputs
     models: dict[str, HostGaussians]
+    region: TrainedRegion | None = None
 
 
 def recorded_camera(camera: Camera) -> RecordedCamera:
@@ -151,6 +157,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
             "system": platform.platform(),
         },
         "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
+        **region_state(trainer.region),  # type: ignore[typeddict-item]  # "region" or nothing
     }
     pixels = {"photograph": photograph, "background": incident.background}
     aims = trainer.depths.aims(incident.view, camera, incident.step, photograph)
@@ -160,7 +167,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     inputs = ViewInputs(0, photograph, camera, incident.background, kept=kept_pixels(photograph), depth=aims)
 
     def reproduced(models: dict[str, HostGaussians]) -> bool:
-        return bool(first_trouble(replay(Bundle(record, trainer.config, inputs, models), device)))
+        return bool(first_trouble(replay(Bundle(record, trainer.config, inputs, models, trainer.region), device)))
 
     trainer.catch_up_exactly()
     models, alone = {}, False
@@ -227,7 +234,8 @@ def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
         aims = DepthTerm(planes, float(record["depth_factor"]))
     background = arrays["background"].astype(np.float32).reshape(3)
     inputs = ViewInputs(0, photograph, camera, background, kept=kept_pixels(photograph), depth=aims)
-    return Bundle(record, config, inputs, {kind: host_model(arrays, kind) for kind in _MODEL_KINDS})
+    models = {kind: host_model(arrays, kind) for kind in _MODEL_KINDS}
+    return Bundle(record, config, inputs, models, region_of(record.get("region")))
 
 
 class _Counts(StepProbe):
@@ -268,7 +276,8 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)
     fields = slot_fields(strategy_of(config).needs(record["step"]), nearness=bundle.inputs.depth is not None)
-    step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
+    of = (device, rasterizer, config, record["step"], record["rates"], fields)
+    step = GradientStep(*of, region=bundle.region)
     step.run((parameters, first, second), bundle.inputs, probe, gradients)
     return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
 

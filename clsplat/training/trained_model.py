@@ -65,6 +65,7 @@ from clsplat.stages.device_gaussians import (
     to_host,
     upload_gaussians,
 )
+from clsplat.stages.region import rows_inside
 from clsplat.training.density import RowPlan
 from clsplat.training.moved_rows import Move, halve, ordered
 from clsplat.training.stability.health import examine
@@ -246,8 +247,9 @@ class TrainedModel:
         changes()
         for group, (rows, values) in plan.values.items():
             set_rows_at(self.parameters[group], rows if moved is None else moved.at(rows), values)
+        of_region = rows_inside(self.parameters["means"], plan.region) if plan.changes and plan.region else None
         for group, change in plan.changes.items():
-            change_rows(self.parameters[group], change)
+            change_rows(self.parameters[group], change, of_region)
         for group in plan.restarted:
             self.first[group].fill(0.0)
             self.second[group].fill(0.0)

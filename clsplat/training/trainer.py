@@ -29,23 +29,22 @@ from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
 from clsplat.training.cameras.refinement import Cameras, ValidationViews
+from clsplat.training.components import components_of
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
-from clsplat.training.mip_filter import MipFilter
-from clsplat.training.preparation import saved_model
+from clsplat.training.moved_rows import drop_outside
+from clsplat.training.preparation import is_along_rays, saved_model
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
-from clsplat.training.step.component import Component
+from clsplat.training.start import Start, check_region, region_state
 from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
-from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.position import Mark, Position
 from clsplat.training.step.speculative_steps import SpeculativeSteps
 from clsplat.training.step.view_order import ViewOrder
-from clsplat.training.step.visible_chunks import VisibleChunks
 from clsplat.training.supervision.depth_targets import DepthTargets
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
@@ -66,6 +65,7 @@ class Trainer:
     further: devices in addition to the model's.
     loader: loader of the steps' photographs and cameras.
     order: order of the views in each pass.
+    region: region in which Gaussians are trained, in the coordinates of their means; None for everywhere.
     background: background of the last view.
     """
 
@@ -74,7 +74,7 @@ class Trainer:
         scene: Scene,
         config: TrainConfig,
         device: Device,
-        initial: Gaussians | None = None,
+        initial: Gaussians | Start | None = None,
         strategy: Callable[[TrainConfig], Strategy] = strategy_of,
         further: Sequence[Device] = (),
         memory: HostMemory = UNLIMITED,
@@ -92,7 +92,7 @@ class Trainer:
         self.planner = MemoryPlanner(scene, config, self.rasterizer, self.photographs, memory, self.batch)
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.array(background_colour(config.background), np.float32)
-        self.given = initial
+        self.begins_with = initial if isinstance(initial, Start) else Start(initial)
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
         self.pending.on &= self.batch is None and not config.refines  # batches and refinement wait for each step
@@ -105,20 +105,19 @@ class Trainer:
         self.tried: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
         self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
-        make = partial(from_scene, self.scene, self.config.random_points, self.position.rng)
-        initial = make() if self.given is None else self.given
+        initial = self.begins_with.model or from_scene(self.scene, self.config.random_points, self.position.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
+        if (earlier := self.begins_with.appearance_of) is not None:
+            self.appearance.begin_from(earlier, fixed=not self.begins_with.trains_appearance)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
-        self.origin, self.near = initial.origin, self.scene.near
-        asked = self.config.perspective
-        self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in self.views))
+        self.origin, self.near, region = initial.origin, self.scene.near, self.begins_with.region
+        self.region = None if region is None else region.relative_to(self.origin)
+        self.by_rays = is_along_rays(self.config, self.views)
         self.loader = ViewLoader(self.config, self.views, self.photographs, self.sizes, self.cameras.of, self.local)
         cameras = [self.local(view.camera) for view in self.views]
-        mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
-        late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
-        next_camera = partial(self.loader.next_camera, self.position)
-        chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial), next_camera)
-        self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths, chunks)
+        others = (self.config, self.rasterizer, (self.appearance, self.cameras, self.depths))
+        of_model = (len(initial), self.scene.length_unit, partial(self.loader.next_camera, self.position))
+        self.components = components_of(*others, cameras, self.region, *of_model)
         self._active = [component for component in self.components if component.on]
         of, files = (self.device, self.rasterizer.work), (self.planner.scratch_file, self.planner.scratch_files)
         plans, contributions = (self._make_plan, self.planner.plan_view), self.strategy.needs().contributions
@@ -223,7 +222,7 @@ class Trainer:
         fields = slot_fields(needs, nearness=self.depths.on)
         explore = exploration_of(self.config, self.step, rates["means"], count, unit)
         of = (self.device, self.rasterizer, self.config, self.step, rates, fields)
-        return partial(GradientStep, *of, explore=explore)
+        return partial(GradientStep, *of, explore=explore, region=self.region)
 
     def _run(
         self,
@@ -407,8 +406,10 @@ class Trainer:
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
-        lengths = self.scene.length_unit, self.scene.extent
-        return ModelState(model.count, step, *lengths, model.arrays, statistics, self.position.rng, self.model.marker())
+        lengths, random = (self.scene.length_unit, self.scene.extent), self.position.rng
+        return ModelState(
+            model.count, step, *lengths, model.arrays, statistics, random, self.model.marker(), self.region
+        )
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out a plan of density control, or of a repair, on the rows of all arrays."""
@@ -428,9 +429,10 @@ class Trainer:
             self.strategy.rearranged(entries & ~FRESH, entries >= FRESH)
 
     def finish(self) -> None:
-        """Finish the model: remove Gaussians that the strategy drops at the end."""
+        """Finish the model: remove Gaussians that the strategy drops at the end, and those outside the region."""
         self.catch_up()
         self._rearrange(self.strategy.at_end(self._state()))
+        self._rearrange(drop_outside(self.parameters["means"], self.region))
 
     def close(self) -> None:
         """End the threads of a batch and of reading photographs, and close the model's scratch file."""
@@ -453,9 +455,8 @@ class Trainer:
 
     def _of_rows(self, parameters: AnyGaussians, start: int, stop: int) -> Gaussians:
         model = download_gaussians(parameters, start, stop)
-        full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
-        full[:, : model.sh.shape[1]] = model.sh
-        model.sh, model.origin, model.near = full, self.origin, self.near
+        unused = (self.config.sh_degree + 1) ** 2 - model.sh.shape[1]
+        model.sh, model.origin, model.near = np.pad(model.sh, ((0, 0), (0, unused), (0, 0))), self.origin, self.near
         model.antialiased, model.by_rays = self.config.antialiased, self.by_rays
         return model
 
@@ -469,7 +470,7 @@ class Trainer:
             if repair is not None:
                 self._apply(repair)
                 arrays, state = self._arrays()
-        return arrays, self.position.state(self.monitor.retries) | state
+        return arrays, self.position.state(self.monitor.retries) | region_state(self.begins_with.region) | state
 
     def _arrays(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         arrays, state = self.model.record()
@@ -487,6 +488,7 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint. Raises InputError for a checkpoint of another training."""
+        check_region(checkpoint, self.begins_with.region)
         with saved_model(checkpoint, self.config.sh_degree) as (models, saved):
             self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
             self.monitor.forget()

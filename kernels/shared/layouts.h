@@ -14,6 +14,7 @@
 #define FRESH 0x80000000u
 #define UNWANTED -1.0f
 #define USELESS -2.0f
+#define FROZEN -3.0f
 #define CAMERA_R00 0
 #define CAMERA_R01 1
 #define CAMERA_R02 2

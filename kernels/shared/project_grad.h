@@ -44,9 +44,24 @@ typedef struct {
   Lanes mean[3], quaternion[4], scale[3], opacity, colour[3];
 } Gradients;
 
+#ifdef REGION
+#define TRAINED trained
+// Sets the gradients of the Gaussians that are not `trained` (LANES) to zero.
+static inline void clear_lanes(const int *trained, Gradients *d) {
+  for (uint lane = 0; lane < LANES; ++lane) {
+    if (trained[lane]) continue;
+    FOR_AXES(k) d->mean[k].lane[lane] = d->scale[k].lane[lane] = d->colour[k].lane[lane] = 0.0f;
+    for (int k = 0; k < 4; ++k) d->quaternion[k].lane[lane] = 0.0f;
+    d->opacity.lane[lane] = 0.0f;
+  }
+}
+#else
+#define TRAINED shown
+#endif
+
 // Computes the gradients *d of the visible Gaussians among LANES rows from first_row on. Returns 0 if none is visible.
 // Sets `shown` (LANES) to 1 for visible rows, and writes their rows of screen, contributions, by_lens and d_sh_rest.
-// Row 0 of d_sh_rest belongs to first_row.
+// Row 0 of d_sh_rest belongs to first_row. Visible Gaussians outside the region (REGION) get zeros in all results.
 static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
                                __global const uint *tile_counts, __global const uint *first_slots,
                                __global const float *slots, __global const float *splats, __global const float *means,
@@ -59,19 +74,40 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #ifdef LENS
                                __global float *by_lens,
 #endif
-                               SH_GRADIENT *d_sh_rest, int *shown, Gradients *d PENALTY_PARAMETERS) {
+                               SH_GRADIENT *d_sh_rest, int *shown, Gradients *d PENALTY_PARAMETERS REGION_PARAMETERS) {
   uint row[LANES];
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
   const uint lanes_used = n - first_row < LANES ? n - first_row : LANES;
   Lanes m[SLOT_STRIDE];
   int any = 0;
+#ifdef REGION
+  int trained[LANES], frozen = 0;
+#endif
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
   Lanes whitening[3]; // zero for invisible Gaussians, whose splats are uninitialised
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
     const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
     shown[lane] = count > 0;
-    if (count == 0) continue;
+#ifdef REGION
+    const size_t at = first_row + lane;
+    trained[lane] = count > 0 && in_region(means + 3 * at REGION_NUMBERS);
+    if (count > 0 && !trained[lane]) {
+      frozen = 1;
+      for (int k = 0; k < 2; ++k) screen[2 * at + k] = 0.0f;
+#ifdef CONTRIBUTIONS
+      contributions[at] = 0.0f;
+#endif
+#ifdef LENS
+      for (int k = 0; k < 4; ++k) by_lens[4 * at + k] = 0.0f;
+#endif
+#ifndef NO_SH_REST
+      SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
+      for (int k = 0; k < 3 * (SH_USED(coefficients) - 1); ++k) d_f[k] = 0.0f;
+#endif
+    }
+#endif
+    if (!TRAINED[lane]) continue;
     any = 1;
 #ifdef ADDED_UP
     __global const float *slot = slots + (size_t)SLOT_STRIDE * (first_row + lane);
@@ -93,6 +129,12 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     whitening[2].lane[lane] = splat[SPLAT_L22];
 #endif
   }
+#ifdef REGION
+  if (frozen && !any) {
+    clear_lanes(trained, d);
+    return 1;
+  }
+#endif
 #ifdef RAYS
   RayProjection p;
   if (!any || !project_ray(first_row, means, quaternions, log_scales, camera, &p)) return 0;
@@ -296,7 +338,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   sh_basis(SH_USED(coefficients), vx, vy, vz, &basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
-    if (!shown[lane]) continue;
+    if (!TRAINED[lane]) continue;
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
                                      splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN].lane[lane] : 0.0f,
@@ -335,7 +377,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
-    if (!shown[lane]) continue;
+    if (!TRAINED[lane]) continue;
     for (int k = 0; k < 2; ++k) screen[2 * i + k] = d_screen[k].lane[lane];
 #ifdef CONTRIBUTIONS
     contributions[i] = m[SLOT_WEIGHT].lane[lane];
@@ -344,5 +386,8 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     for (int k = 0; k < 4; ++k) by_lens[4 * i + k] = lens[k].lane[lane];
 #endif
   }
+#ifdef REGION
+  if (frozen) clear_lanes(trained, d);
+#endif
   return 1;
 }

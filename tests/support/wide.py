@@ -17,6 +17,7 @@ from tiny import hidden_model
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.training import moved_rows, trained_model
+from clsplat.training.start import Start
 from clsplat.training.step import visible_chunks
 from clsplat.training.trainer import Trainer
 
@@ -56,7 +57,7 @@ def start_wide(patch: pytest.MonkeyPatch, *, around: bool = True) -> None:
     start = Trainer._start
 
     def begin(trainer: Trainer) -> None:
-        trainer.given = wide_model(around=around)
+        trainer.begins_with = Start(wide_model(around=around))
         start(trainer)
 
     patch.setattr(Trainer, "_start", begin)

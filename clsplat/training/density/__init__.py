@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.optimisation.density_rules import MarkRules
+from clsplat.optimisation.trained_region import TrainedRegion
 
 
 class StatisticsNeeds(NamedTuple):
@@ -65,6 +66,8 @@ class ModelState:
     statistics: arrays by name (`stages.density.DensityStatistics`).
     rng: random generator of the training.
     marker: applies rules to the Gaussians.
+    region: the region in which Gaussians are trained, in the coordinates of their means; None for everywhere. Plans
+        leave the other Gaussians as they are.
     """
 
     count: int
@@ -75,6 +78,7 @@ class ModelState:
     statistics: Mapping[str, HostCopy]
     rng: np.random.Generator
     marker: Marker
+    region: TrainedRegion | None = None
 
 
 SPLIT_GROUPS = ("means", "quaternions", "log_scales")
@@ -94,6 +98,7 @@ class RowPlan:
         any second half.
     halved: parameter groups that `halves` reads.
     changes: by parameter group, a function from values of some rows to the new values of these rows.
+    region: the region in which `changes` apply, in the coordinates of the means; None for everywhere.
     restarted: groups whose moments start at zero in every row.
     new_statistics: True if all statistics except contributions start from zero.
     forget_contributions: True if contributions become unknown in every row.
@@ -106,6 +111,7 @@ class RowPlan:
     halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]] | None = None
     halved: tuple[str, ...] = SPLIT_GROUPS
     changes: Mapping[str, Callable[[Float32], Float32]] = field(default_factory=dict)
+    region: TrainedRegion | None = None
     restarted: tuple[str, ...] = ()
     new_statistics: bool = False
     forget_contributions: bool = False

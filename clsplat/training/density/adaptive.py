@@ -70,7 +70,13 @@ class Adaptive(Strategy):
                 )
         if is_reset_due(config, step, white=self.white):
             changes = {"opacity_logits": partial(reset_opacities, config)}
-            made = replace(made, changes=changes, restarted=("opacity_logits",), forget_contributions=True)
+            made = replace(
+                made,
+                changes=changes,
+                region=model.region,
+                restarted=("opacity_logits",),
+                forget_contributions=True,
+            )
         return made
 
 
@@ -138,7 +144,7 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
     the last complete epoch and of the current epoch.
     """
     opaque = np.log(config.min_opacity / (1 - config.min_opacity))
-    rules = MarkRules(transparent=edge(lambda logit: logit >= opaque))
+    rules = MarkRules(transparent=edge(lambda logit: logit >= opaque), region=model.region)
     if "whole_totals" not in model.statistics:
         return rules
     if config.min_contribution > 0:

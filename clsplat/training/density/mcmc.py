@@ -8,6 +8,7 @@ in `optimisation.step_noise`, and the settings are `DensityConfig` in `config/tr
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from math import inf
@@ -15,7 +16,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Bool, Float32, Float64
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.optimisation.density_rules import MarkRules
@@ -64,7 +65,11 @@ class Mcmc(Strategy):
         dead = (opacities <= config.min_opacity) | (lengths < 1e-8)
         if config.max_screen_radius > 0:
             dead |= model.statistics["radii"].get() > config.max_screen_radius
-        if dead.all():
+        frozen = np.zeros(model.count, np.bool_)
+        if model.region is not None:
+            frozen = ~model.region.contains(model.parameters["means"].get())
+            dead &= ~frozen
+        if (dead | frozen).all():
             raise ClsplatError(
                 f"step {model.step}: every Gaussian is dead: under --density.min-opacity {config.min_opacity}, without "
                 "a rotation, or larger than --density.max-screen-radius; lower --density.min-opacity or "
@@ -73,7 +78,7 @@ class Mcmc(Strategy):
         more, places = wanted(config, model.step, model.count) - model.count, np.flatnonzero(dead)
         if len(places) + more == 0:
             return RowPlan(new_statistics=True)
-        scores = model.marker.scores(SCORE_ALL_RULES)
+        scores = model.marker.scores(replace(SCORE_ALL_RULES, region=model.region))
         scores[dead] = 0
         split = strongest(scores, len(places) + more)
         places, left = places[: len(split)], places[len(split) :]
@@ -85,7 +90,7 @@ class Mcmc(Strategy):
         for second, changed in ((False, split), (True, halves[len(split) :])):
             for group, parts in long_halves(of_split, second).items():
                 groups[group][changed] = parts
-        shares = self._moved(groups, rows, left, model.rng)
+        shares = self._moved(groups, rows, left, frozen, model.rng)
         changed, placed = np.union1d(halves, shares), np.concatenate([halves, left])
         fresh = np.zeros(len(rows), np.bool_)
         fresh[changed] = True
@@ -94,13 +99,19 @@ class Mcmc(Strategy):
         return RowPlan(rows=rows.astype(np.uint32), fresh=fresh, values=values, new_statistics=True)
 
     def _moved(
-        self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
+        self,
+        groups: dict[str, Float32],
+        rows: NDArray[np.int64],
+        left: NDArray[np.int64],
+        frozen: Bool,
+        rng: np.random.Generator,
     ) -> NDArray[np.int64]:
         """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
         2024).
 
         groups: parameters of the new model by group, updated in place.
         rows: source rows of the new model's rows, updated in place.
+        frozen: (n,), True for old rows outside the region of the training, to which none is relocated.
         Returns the rows whose values change.
         """
         if len(left) == 0:
@@ -108,7 +119,7 @@ class Mcmc(Strategy):
         least, spread = self.config.min_opacity, self.config.spread
         opacities = 1 / (1 + np.exp(-groups["opacity_logits"].astype(np.float64)))
         log_scales = groups["log_scales"].astype(np.float64)
-        opacities[left] = 0
+        opacities[left] = opacities[frozen[rows]] = 0
         parents = draw(opacities, len(left), rng)
         own, total = np.unique(parents, return_counts=True)
         opacities[own], by = shared(opacities[own], np.minimum(total + 1, MAX_GAUSSIANS_PER_PLACE), least)

@@ -16,6 +16,7 @@ from clsplat.gaussians import group_shapes
 from clsplat.layouts.columns import SlotFields
 from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
@@ -83,6 +84,7 @@ class GradientStep:
         if the host may still have to read an earlier step's sums.
     room: number of pairs that there is memory for, if the step is launched by capacity; None counts the pairs first.
     explore: noise and penalties of the step.
+    region: the region in which Gaussians change, in the coordinates of their means; None for everywhere.
     """
 
     device: Device
@@ -95,6 +97,7 @@ class GradientStep:
     turn: int = 0
     room: PairCapacity | None = None
     explore: Exploration = NO_EXPLORATION
+    region: TrainedRegion | None = None
 
     @cached_property
     def thinning(self) -> Thinning | None:
@@ -329,6 +332,7 @@ class GradientStep:
                 sh_rest=self.adam_step.updates_sh_rest,
                 explore=self.explore,
                 by_lens=rows.by_lens,
+                region=self.region,
             )
             for part in inputs.parts:
                 part.add_rows(rows)
@@ -374,8 +378,8 @@ class GradientStep:
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            project_step(rows.device, step, rows.model, *view, explore=self.explore)
-        noise(self.device, self.explore, rows.parameters, rows.start, readback)
+            project_step(rows.device, step, rows.model, *view, explore=self.explore, region=self.region)
+        noise(self.device, self.explore, rows.parameters, rows.start, readback, self.region)
 
 
 StepMaker = Callable[..., GradientStep]

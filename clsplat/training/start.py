@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`Start`: a model that a training begins with, and what else the training takes from an earlier one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.optimisation.trained_region import TrainedRegion
+from clsplat.runs.checkpoints import Checkpoint, unusable
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What a training begins with, in place of Gaussians from the scene's points.
+
+    model: the initial Gaussians. None makes them from the scene's points.
+    region: the region in which the training changes Gaussians. None means everywhere.
+    appearance_of: folder of a run whose appearance is used for photographs of the same name, and is not trained. None
+        means that the training has an appearance of its own.
+    trains_appearance: True to train the appearance from where `appearance_of` has it.
+    """
+
+    model: Gaussians | None = None
+    region: TrainedRegion | None = None
+    appearance_of: Path | None = None
+    trains_appearance: bool = False
+
+
+NO_START = Start()
+"""The start of a training from the scene's points."""
+
+
+def check_start(start: Start, config: TrainConfig) -> None:
+    """Raise InputError if a training with the settings `config` cannot begin with `start`."""
+    if not isinstance(start, Start):
+        raise InputError(f"start is {start!r:.100}, expected Start(model=..., region=...)")
+    model, region = start.model, start.region
+    if region is not None and model is None:
+        raise InputError("start has a region but no model, expected the model whose Gaussians the region selects")
+    if region is not None and config.refines:
+        raise InputError(
+            "start has a region, and the settings refine cameras: only the whole scene can refine them, so expected "
+            "refine_poses=False and refine_lenses=False"
+        )
+    if model is None:
+        return
+    try:
+        model.check()
+    except ValueError as error:
+        raise InputError(f"start: the model's {error}") from None
+    if model.sh_degree > config.sh_degree:
+        raise InputError(
+            f"start: the model has SH degree {model.sh_degree}, expected at most sh_degree {config.sh_degree} of the "
+            "settings"
+        )
+    if model.antialiased != config.antialiased:
+        raise InputError(
+            f"start: the model was trained with antialiased={model.antialiased}, the settings have "
+            f"antialiased={config.antialiased}; expected the same"
+        )
+    if not len(model) or (region is not None and not region.contains(model.means, model.origin).any()):
+        place = "" if region is None else " in the region"
+        raise InputError(f"start: the model of {len(model):,} Gaussians has none{place}, expected at least one")
+
+
+def region_state(region: TrainedRegion | None) -> dict[str, Any]:
+    """Return the JSON state that a checkpoint has for the region of the training; empty without one."""
+    if region is None:
+        return {}
+    edges = [[None if np.isinf(edge) else edge for edge in side.tolist()] for side in (region.low, region.high)]
+    return {"region": {"axes": region.axes.tolist(), "low": edges[0], "high": edges[1]}}
+
+
+def region_of(state: Mapping[str, Any] | None) -> TrainedRegion | None:
+    """Return the region of the JSON state that `region_state` has under "region"; None for None."""
+    if state is None:
+        return None
+    low, high = (
+        [end if edge is None else edge for edge in state[side]] for side, end in (("low", -inf), ("high", inf))
+    )
+    return TrainedRegion(np.array(state["axes"]), np.array(low), np.array(high))
+
+
+def check_region(checkpoint: Checkpoint, region: TrainedRegion | None) -> None:
+    """Raise InputError if a checkpoint was written with another region than `region`."""
+    saved, now = checkpoint.state.get("region"), region_state(region).get("region")
+    if saved != now:
+        raise unusable(
+            checkpoint,
+            f"it was written with the region {saved or 'of the whole scene'}, and now the region is "
+            f"{now or 'the whole scene'}: continue with the command that began the training",
+        )
