@@ -12,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+import dispatching
 import pytest
 from calls import refuses
 from counting import counted, counting_task
@@ -153,34 +154,19 @@ def test_a_task_of_another_process_is_waited_for(tmp_path: Path, monkeypatch: py
     assert counted(tmp_path, "a") == 1
 
 
-DISPATCH = """
-import json, sys
-from pathlib import Path
-from counting import counting_task
-from clsplat.jobs.dispatcher import run_tasks
-from clsplat.jobs.local_engine import LocalEngine
-from clsplat.process import terminable
-folder = Path(sys.argv[1])
-tasks = [counting_task(folder, str(number), 200, seconds=0.02) for number in range(2)]
-try:
-    with terminable():
-        run_tasks(tasks, LocalEngine(2), folder / "jobs")
-except KeyboardInterrupt as error:
-    print("interrupted", *error.args)
-"""
-
-
 @posix
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_the_end_of_the_dispatcher_ends_the_commands(tmp_path: Path, number: signal.Signals) -> None:
     """With Ctrl-C it waits for them; after SIGKILL they end by themselves. The same tasks then go on."""
-    process = subprocess.Popen([sys.executable, "-c", DISPATCH, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, dispatching.__file__, str(tmp_path), "--steps", "200"], stdout=subprocess.PIPE, text=True
+    )
     while not all((tmp_path / f"{name}.pid").exists() and counted(tmp_path, name) > 3 for name in "01"):
         time.sleep(0.01)
     process.send_signal(number)
     out, _ = process.communicate(timeout=60)
     if number != signal.SIGKILL:
-        assert out == "interrupted after 0 of 2 tasks; the same command goes on\n"
+        assert out == "interrupted after 0 of 3 tasks; the same command goes on\n"
     pids = [int((tmp_path / f"{name}.pid").read_text()) for name in "01"]
     until = time.monotonic() + (0 if number != signal.SIGKILL else 30)
     while any(alive(pid) for pid in pids) and time.monotonic() < until:

@@ -21,7 +21,8 @@ class DaskProcesses:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.processes = folder, {}  # type: ignore[var-annotated]
+        self.folder = folder
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -55,6 +56,10 @@ class DaskProcesses:
             )
         self.processes[name] = process
         return process.pid
+
+    def runs(self, name: str) -> bool:
+        """True if the process runs."""
+        return name in self.processes and self.processes[name].poll() is None
 
     def kill(self, name: str) -> None:
         """Kill a process with SIGKILL."""
