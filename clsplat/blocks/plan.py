@@ -69,7 +69,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Division:
+class Partition:
     """The options by which a scene is divided into blocks.
 
     blocks: "auto", a number of blocks such as "4", or numbers of blocks along both axes such as "2x3".
@@ -104,7 +104,7 @@ class BlockPlan:
 
     scene: Path
     settings: TrainConfig
-    division: Division
+    division: Partition
     up: Point
     axes: Axes
     margin: float
@@ -196,7 +196,7 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
     plan = BlockPlan(
         scene=Path(_text(document["scene"])),
         settings=config_of(document["train"], path),
-        division=Division(
+        division=Partition(
             _text(division["blocks"]), _count_or_none(division["memory"]), _count_or_none(division["photographs"])
         ),
         up=_point(document["up"]),

@@ -23,7 +23,7 @@ from clsplat.errors import InputError, warn
 from clsplat.progress import StageProgress, aligned
 
 if TYPE_CHECKING:
-    from clsplat.blocks.plan import BlockPlan, Division, Point
+    from clsplat.blocks.plan import BlockPlan, Partition, Point
     from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
 
@@ -96,7 +96,7 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     """Make the plan. Errors in the command line are reported before anything is written."""
     from clsplat.blocks.plan import PLAN_FILE
     from clsplat.blocks.plan_check import check_new_plan, kept_plan
-    from clsplat.blocks.planning import coarse_run
+    from clsplat.blocks.planning.new_plan import coarse_run
 
     division, up = _checked(verb)
     city = verb.output
@@ -117,11 +117,11 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     return 0
 
 
-def _checked(verb: BlocksPlanVerb) -> tuple[Division, Point | None]:
+def _checked(verb: BlocksPlanVerb) -> tuple[Partition, Point | None]:
     """Check the flags. Returns the options of the division, and the up direction if it is given."""
-    from clsplat.blocks.ground import parse_up
-    from clsplat.blocks.plan import Division
-    from clsplat.blocks.split import parse_blocks
+    from clsplat.blocks.plan import Partition
+    from clsplat.blocks.planning.ground import parse_up
+    from clsplat.blocks.planning.split import parse_blocks
 
     parse_blocks(verb.blocks)
     for flag, value in (("--block-mem", verb.block_mem), ("--block-photographs", verb.block_photographs)):
@@ -132,7 +132,7 @@ def _checked(verb: BlocksPlanVerb) -> tuple[Division, Point | None]:
     verb.device.check()
     verb.config.check()
     memory = parse_bytes(verb.block_mem, "--block-mem")
-    return Division(verb.blocks, memory, verb.block_photographs), parse_up(verb.up) if verb.up is not None else None
+    return Partition(verb.blocks, memory, verb.block_photographs), parse_up(verb.up) if verb.up is not None else None
 
 
 def _scene(verb: BlocksPlanVerb, services: Services, coarse: Run | None) -> tuple[Scene, TrainConfig]:
@@ -157,9 +157,9 @@ def _trained(verb: BlocksPlanVerb, services: Services, coarse: Run | None, scene
     coarse: the run if it has begun before.
     scene, config: the scene at the size of the whole, and the settings of the whole.
     """
-    from clsplat.blocks.coarse import coarse_settings
     from clsplat.blocks.plan import COARSE_FOLDER
     from clsplat.blocks.plan_check import check_coarse
+    from clsplat.blocks.planning.coarse import coarse_settings
     from clsplat.cli import train
     from clsplat.runs.run import Run
 
@@ -183,17 +183,17 @@ def _made(
     coarse: Run,
     scene: Scene,
     config: TrainConfig,
-    options: tuple[Division, Point | None],
+    options: tuple[Partition, Point | None],
 ) -> BlockPlan:
     """Divide the scene with the coarse model, and write the plan and its picture.
 
     options: options of the division, and the up direction if it is given.
     """
-    from clsplat.blocks.ground import ground_of
-    from clsplat.blocks.measurement import LoadMeasurement
-    from clsplat.blocks.picture import plan_svg
     from clsplat.blocks.plan import PLAN_PICTURE_FILE, write_plan
-    from clsplat.blocks.planning import coarse_cameras, made_plan
+    from clsplat.blocks.planning.ground import ground_of
+    from clsplat.blocks.planning.measurement import LoadMeasurement
+    from clsplat.blocks.planning.new_plan import coarse_cameras, made_plan
+    from clsplat.blocks.planning.picture import plan_svg
     from clsplat.files.atomic import atomic_write
     from clsplat.gaussians import Gaussians
     from clsplat.selftest.result import stages_of_training
@@ -214,8 +214,8 @@ def _made(
 
 def _tell(city: Path, plan: BlockPlan) -> None:
     """Print the table of blocks, and where the plan is."""
-    from clsplat.blocks.picture import plan_table, plan_total
     from clsplat.blocks.plan import PLAN_FILE
+    from clsplat.blocks.planning.picture import plan_table, plan_total
 
     print("\n".join(aligned(plan_table(plan))))
     print(plan_total(plan))
