@@ -18,8 +18,8 @@ from clsplat.files.documents import load_document
 from clsplat.runs.settings import config_of, table_of
 from clsplat.version import package_version
 
-PLAN_FILE, PLAN_PICTURE_FILE = "plan.json", "plan.svg"
-"""Names of the plan's files in a city's folder."""
+PLAN_FILE = "plan.json"
+"""Name of the plan's file in a city's folder. Its picture is PLAN_PICTURE_FILE (`clsplat.report`)."""
 COARSE_FOLDER, BLOCKS_FOLDER = "coarse", "blocks"
 """Names of the folders, in a city's folder, of the coarse model's run and of the blocks' runs."""
 MAX_PLAN_BYTES = 256 << 20

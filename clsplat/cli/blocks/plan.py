@@ -189,13 +189,14 @@ def _made(
 
     options: options of the division, and the up direction if it is given.
     """
-    from clsplat.blocks.plan import PLAN_PICTURE_FILE, write_plan
+    from clsplat.blocks.plan import write_plan
     from clsplat.blocks.planning.ground import ground_of
     from clsplat.blocks.planning.measurement import LoadMeasurement
     from clsplat.blocks.planning.new_plan import coarse_cameras, made_plan
     from clsplat.blocks.planning.picture import plan_svg
     from clsplat.files.atomic import atomic_write
     from clsplat.gaussians import Gaussians
+    from clsplat.report import PLAN_PICTURE_FILE
     from clsplat.selftest.result import stages_of_training
 
     division, up = options
