@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -27,6 +28,20 @@ def apart() -> dict[str, Any]:
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}
+
+
+def module_command(module: str, *words: str) -> list[str]:
+    """The command that runs a module of this package with the arguments `words`.
+
+    Unlike `python -m`, the command imports nothing from the current folder.
+    """
+    root = str(Path(__file__).resolve().parents[1])
+    code = (
+        f"import sys; sys.path[:] = [part for part in sys.path if part]; root = {root!r}; "
+        "sys.path[:0] = [] if root in sys.path else [root]; "
+        f"import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
+    )
+    return [sys.executable, "-c", code, *words]
 
 
 def endings() -> tuple[signal.Signals, ...]:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TextIO
 
 from typing_extensions import Self
 
+from clsplat.errors import examples
+
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
@@ -27,6 +29,11 @@ METRIC_SMOOTHING_WEIGHT = 0.1
 """Weight of the newest report in the displayed PSNR and loss, which are smoothed because views differ."""
 RATE_WINDOW_SECONDS = 20.0
 """Seconds of training over which the displayed rate is averaged."""
+TASK_RATE_WINDOW_SECONDS = 600.0
+"""Seconds over which the steps of all tasks are averaged, to estimate the remaining time."""
+ProgressStyle = Literal["auto", "json", "openjd", "none"]
+"""How progress is written. "auto": a bar on standard error if that is a terminal, else lines of text. "json": one
+object per line. "openjd": progress lines of Open Job Description. "none": nothing."""
 
 
 class RemainingTime(Protocol):
@@ -88,11 +95,15 @@ class TrainProgress(LiveBar):
     """Progress of a training of `total` steps. Call it with a `training.loop.StepReport` after some or all steps.
 
     forecast: estimates the remaining time. Without it the remaining steps are assumed to take as long as the last ones.
+    style: "auto": a bar, or lines on standard error. "openjd": lines on standard output.
     """
 
-    def __init__(self, total: int, forecast: RemainingTime | None = None) -> None:
-        super().__init__(f"step 0/{total}", total)
-        self.total, self.forecast = total, forecast
+    def __init__(
+        self, total: int, forecast: RemainingTime | None = None, style: Literal["auto", "openjd"] = "auto"
+    ) -> None:
+        if style == "auto":
+            super().__init__(f"step 0/{total}", total)
+        self.total, self.forecast, self.style = total, forecast, style
         self.last: Any = None
         self.recent: deque[Any] = deque()
         self.loss, self.psnr = 0.0, 0.0
@@ -148,7 +159,10 @@ class TrainProgress(LiveBar):
 
     def _print_line(self) -> None:
         with suppress(OSError):  # the program that reads the output has ended: training goes on
-            print(f"{self._numbers()}{self._left()}", file=sys.stderr, flush=True)
+            if self.style == "openjd":
+                print(openjd_lines(self.last.step / self.total, f"{self._numbers()}{self._left()}"), flush=True)
+            else:
+                print(f"{self._numbers()}{self._left()}", file=sys.stderr, flush=True)
         self.printed_at, self.printed_step = time.monotonic(), self.last.step
 
 
@@ -194,9 +208,7 @@ class FrameProgress(LiveBar):
       "json": one object per line on `lines`. "openjd": progress lines of Open Job Description. "none": nothing.
     """
 
-    def __init__(
-        self, total: int, style: Literal["auto", "json", "openjd", "none"] = "auto", *, lines: TextIO | None = None
-    ) -> None:
+    def __init__(self, total: int, style: ProgressStyle = "auto", *, lines: TextIO | None = None) -> None:
         self.total, self.style, self.lines, self.done = total, style, lines, 0
         self.written, self.began = 0, time.monotonic()
         self.first_at = self.began
@@ -225,7 +237,7 @@ class FrameProgress(LiveBar):
             text = json.dumps(line)
         elif self.style == "openjd":
             did = "exists" if record.skipped else f"took {record.seconds:.2f} s"
-            text = f"openjd_progress: {100 * self.done / self.total:.1f}\nopenjd_status: frame {record.frame} {did}"
+            text = openjd_lines(self.done / self.total, f"frame {record.frame} {did}")
         elif record.skipped:
             return
         else:
@@ -244,6 +256,71 @@ class FrameProgress(LiveBar):
         each = (now - self.first_at) / (self.written - 1) if self.written > 1 else now - self.began
         seconds = (self.total - self.done) * each
         return f"  {duration(seconds)} left" if seconds >= 0.5 else ""
+
+
+class TaskProgress(LiveBar):
+    """Progress of tasks. Call it with a `jobs.dispatcher.JobProgress` at intervals.
+
+    what: what the tasks are, in the plural, such as "tasks".
+    style: "auto": a bar or lines on standard error. "openjd": lines on standard output.
+    """
+
+    def __init__(self, what: str = "tasks", style: Literal["auto", "openjd"] = "auto") -> None:
+        if style == "auto":
+            super().__init__(what, 1)
+        self.what, self.style = what, style
+        self.recent: deque[tuple[float, int]] = deque()
+        self.last: Any = None
+        self.printed_at, self.printed = float("-inf"), ""
+
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        if self.live is None and self.last is not None:
+            self._print_line()
+
+    def __call__(self, progress: Any) -> None:
+        now = time.monotonic()
+        self.last = progress
+        self.recent.append((now, progress.steps))
+        while len(self.recent) > 2 and now - self.recent[1][0] >= TASK_RATE_WINDOW_SECONDS:
+            self.recent.popleft()
+        if self.live is not None:
+            text = self._text(progress) + self._left(progress)
+            self.live.update(self.task, completed=progress.steps, total=progress.total_steps, description=text)
+        elif now - self.printed_at >= PLAIN_LINE_SECONDS:
+            self._print_line()
+            self.printed_at = now
+
+    def _print_line(self) -> None:
+        """Print a line, unless it says the same as the last one."""
+        if (text := self._text(self.last)) == self.printed:
+            return
+        self.printed, line = text, text + self._left(self.last)
+        with suppress(OSError):  # the program that reads the output has ended: the tasks go on
+            if self.style == "openjd":
+                print(openjd_lines(self.last.steps / max(self.last.total_steps, 1), line), flush=True)
+            else:
+                print(line, file=sys.stderr, flush=True)
+
+    def _text(self, progress: Any) -> str:
+        failed = f", {progress.failed:,} failed" if progress.failed else ""
+        names = f"  now {examples(progress.running)}" if progress.running else ""
+        return (
+            f"{progress.done:,} of {progress.total:,} {self.what} done{failed}  "
+            f"step {progress.steps:,}/{progress.total_steps:,}{names}"
+        )
+
+    def _left(self, progress: Any) -> str:
+        """Return a text with the remaining time; empty without progress in the last TASK_RATE_WINDOW_SECONDS."""
+        (begin, first), (end, last) = self.recent[0], self.recent[-1]
+        if last <= first or not progress.running:
+            return ""
+        return f"  {duration((progress.total_steps - last) * (end - begin) / (last - first))} left"
+
+
+def openjd_lines(fraction: float, status: str) -> str:
+    """Lines by which a task of Open Job Description reports its progress. fraction: from 0 to 1."""
+    return f"openjd_progress: {100 * fraction:.1f}\nopenjd_status: {status}"
 
 
 def duration(seconds: float) -> str:

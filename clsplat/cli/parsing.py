@@ -9,17 +9,21 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import make_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import tyro
 from tyro.conf import subcommand
 
 from clsplat.cli.flags import grouped_help, near, unknown_flags
 from clsplat.cli.options import Verb
+from clsplat.progress import aligned
+
+if TYPE_CHECKING:
+    from clsplat.cli.session import Services
 
 PROGRAM_DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 VERBS = {
@@ -30,6 +34,10 @@ VERBS = {
     "capture": "Turn photos or videos into a trained model, with its report, thumbnail and turntable.",
     "sfm": "Turn photos and videos into a scene: COLMAP's cameras and points, and the undistorted images.",
     "train": "Train a scene.",
+    "blocks plan": "Divide a large scene into blocks, which can be trained on many machines.",
+    "blocks train": "Train one block of a plan, as a run in CITY/blocks.",
+    "blocks merge": "Merge the models of all blocks into CITY/merged.ply.",
+    "blocks finish": "Train the merged model on all photographs, evaluate it, and write the report.",
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
@@ -46,12 +54,15 @@ VERBS = {
     "selftest": "Test every device: build the kernels, compare each stage with its float64 "
     "reference and with stored digests.",
 }
-"""Verbs in the order of --help, with the first sentence of each one's help.
+"""Verbs in the order of --help, with the first sentence of each one's help. A verb may have two words.
 
 Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `run`. A module is imported only when its
 verb is called.
 """
-_VERB_MODULES = {"render": "render.verb"}
+_VERB_MODULES = {
+    "render": "render.verb",
+    **{f"blocks {name}": f"blocks.{name}" for name in ("plan", "train", "merge", "finish")},
+}
 """Module, relative to `clsplat.cli`, of each verb that has a folder of its own."""
 
 
@@ -61,14 +72,36 @@ def verb_module(name: str) -> Any:
 
 
 def verb_class(name: str) -> type[Verb]:
-    """Import the dataclass of a verb's arguments, such as `TrainVerb` for "train"."""
-    kind: type[Verb] = getattr(verb_module(name), f"{name.capitalize()}Verb")
+    """Import the dataclass of a verb's arguments, such as `TrainVerb` for "train", BlocksPlanVerb for "blocks plan"."""
+    kind: type[Verb] = getattr(verb_module(name), f"{_class_name(name)}Verb")
     return kind
+
+
+def run_function(verb: Verb) -> Callable[[Verb, Services], int]:
+    """Return the function `run` of a verb's module."""
+    name = next(name for name in VERBS if f"{_class_name(name)}Verb" == type(verb).__name__)
+    function: Callable[[Verb, Services], int] = verb_module(name).run
+    return function
+
+
+def _class_name(name: str) -> str:
+    return "".join(word.capitalize() for word in name.split())
 
 
 def _listed(name: str) -> type:
     """Placeholder class without arguments, for a verb that `clsplat --help` only lists."""
-    return make_dataclass(name.capitalize(), (), namespace={"__doc__": VERBS[name]})
+    return make_dataclass(_class_name(name), (), namespace={"__doc__": VERBS[name]})
+
+
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """Join the first two words to the name of a verb of two words. Without such a verb, the words stay apart."""
+    name = " ".join(arguments[:2])
+    return [name, *arguments[2:]] if name in VERBS and " " in name else list(arguments)
+
+
+def _family(arguments: Sequence[str]) -> list[str]:
+    """Return the verbs of two words that begin with the first word of a command line."""
+    return [name for name in VERBS if arguments and name.startswith(f"{arguments[0]} ")]
 
 
 def parse(arguments: Sequence[str]) -> Verb:
@@ -76,6 +109,14 @@ def parse(arguments: Sequence[str]) -> Verb:
 
     Raises InputError. Raises SystemExit after reporting an error in one line, or after printing the help.
     """
+    arguments = _joined(arguments)
+    family = _family(arguments)  # such as the verbs that `clsplat blocks --help` lists
+    if family and set(arguments[1:]) <= {"-h", "--help"}:
+        if arguments[1:]:
+            print("\n".join(aligned([(f"clsplat {name}", VERBS[name]) for name in family], left=(0, 1))))
+            raise SystemExit(0)
+        report(f"{arguments[0]} is not complete, expected one of {', '.join(family)}", 2, arguments)
+        raise SystemExit(2)
     kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}
     commands: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
     boxes = io.StringIO()
@@ -115,7 +156,9 @@ def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> 
     word = next((word for word in arguments if not word.startswith("-")), "")
     if not word or word in VERBS:
         return said
-    found = near(word, list(VERBS))
+    if _family(arguments):
+        word = " ".join(arguments[:2])
+    found = near(word, [*VERBS, *(name.split()[0] for name in VERBS if " " in name)])
     return f"{word} is not a verb, did you mean {found}?" if found else said
 
 

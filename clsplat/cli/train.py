@@ -6,30 +6,26 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable, Collection, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Collection
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, Suppress, arg
 
-from clsplat.cli.eval import print_summary, tell_of_lpips
-from clsplat.cli.options import Flag, Memory, OptionalInt, Output, PageOptions, SeveralDevices, Verb, with_given
+from clsplat.cli.eval import print_summary
+from clsplat.cli.options import Flag, OptionalInt, Output, PageOptions, Verb, with_given
 from clsplat.cli.session import Services, load_scene
-from clsplat.config.checks import parse_bytes
+from clsplat.cli.training_run import TrainingMachine, tell_of_training, train_run
 from clsplat.config.presets import Preset, Schedule, bundled, by_passes, steps_made_for
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import open_input
-from clsplat.progress import TrainProgress
 
 if TYPE_CHECKING:
-    from clsplat.device.context import Device
-    from clsplat.rendering.memory_plan import Plan
     from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
-    from clsplat.viewer.training_view import TrainingView
 
 
 @dataclass(frozen=True)
@@ -54,20 +50,10 @@ class TrainVerb(Verb):
     """With --resume: continue although the scene or a photograph has changed since the run began."""
     overwrite: Flag = False
     """Replace the run in the output folder. Files that clsplat did not write stay."""
-    device: Annotated[SeveralDevices, arg(name="")] = field(default_factory=SeveralDevices)
+    device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
     view: Flag = False
     """Show the growing model on a page in the browser, where training can be paused too (see clsplat view)."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
-    max_host_mem: Memory = None
-    """Limit of main memory for photographs and Gaussians together, such as 4GiB. Photographs beyond it are read from
-    the cache (--cache), or decoded again. The result is the same. If not given: all photographs stay in memory."""
-    cache: Annotated[str | None, arg(metavar="DIR|none")] = None
-    """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
-    If not given: with --max-host-mem, cache/ in the run's folder until the training has finished; otherwise none."""
-    scratch: Annotated[str | None, arg(metavar="DIR")] = None
-    """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. A file in it, at most 2.2 times as
-    large as the parameters and Adam's moments, stays after the training, as checkpoints need it. If not given:
-    scratch/ in the run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -160,11 +146,9 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
     from clsplat.selftest.result import stages_of_training
-    from clsplat.training.memory import HostMemory
     from clsplat.training.preparation import check_steps_left
 
     verb.device.check()
-    parse_bytes(verb.max_host_mem, "--max-host-mem")
     verb.config.check()
     _check_used(verb.config, verb.given)
     if verb.frames is not None and verb.frames < 1:
@@ -194,15 +178,15 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     )
     stages = stages_of_training(config)
     devices = [services.require(device, stages) for device in devices]
-    HostMemory.chosen(verb.max_host_mem, verb.cache, None, verb.scratch).check(scene, config, devices[0])
+    verb.device.check_memory(scene, config, devices[0])
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
-    run.resume_command += _flags_of_machine(verb)
+    run.resume_command = shlex.join([*shlex.split(run.resume_command), *verb.device.flags])
     if changed:
         scene_record.write(run, scene)
-    _tell_of(scene, config, devices)
-    _train_run(verb, services, scene, run, devices, page)
+    tell_of_training(scene, config, devices)
+    train_run(services, scene, run, devices, verb.device, page=page)
     result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))
@@ -210,80 +194,6 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
         print_summary(result)
     print(f"model in {run.model_path}", file=sys.stderr)
     return 0
-
-
-def _flags_of_machine(verb: TrainVerb) -> str:
-    """Return the flags about devices and memory as text for the command that resumes the run. No file records them."""
-    given = {
-        "--device": verb.device.selector,
-        "--max-device-mem": verb.device.max_device_mem,
-        "--max-host-mem": verb.max_host_mem,
-        "--cache": verb.cache,
-        "--scratch": verb.scratch,
-    }
-    return "".join(f" {flag} {shlex.quote(str(value))}" for flag, value in given.items() if value is not None)
-
-
-def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> None:
-    """Print the numbers of pictures and points, the devices, and the reason if LPIPS cannot be measured."""
-    order = " in near order" if config.view_order == "near" else ""
-    unit = f", length unit {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
-    on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
-    print(
-        f"{scene.name}: {len(scene.train_views)} training pictures{order}, {len(scene.test_views)} held out, "
-        f"{len(scene.points):,} points{unit}; on {on} (the first steps may take longer, while kernels are built)",
-        file=sys.stderr,
-    )
-    for note in scene.frame.notes:
-        print(f"{scene.name}: {note}", file=sys.stderr)
-    if scene.test_views:
-        tell_of_lpips()
-
-
-def _train_run(
-    verb: TrainVerb,
-    services: Services,
-    scene: Scene,
-    run: Run,
-    devices: Sequence[Device],
-    page: Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]] | None,
-) -> None:
-    """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
-
-    page: function that returns a context manager, which serves the viewer's page; None without --view.
-    """
-    from clsplat.training.forecast import Forecast
-
-    views = scene.train_views
-    pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
-
-    def print_plan(plan: Plan) -> None:
-        if devices[0].memory.limit is not None or any(plan.pieces):
-            print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
-
-    try:
-        with (
-            page(scene, run.config) if page else nullcontext() as between,
-            TrainProgress(run.config.iterations, Forecast(run.config, len(views), pixels)) as progress,
-        ):
-            services.train(
-                scene,
-                run.config,
-                device=devices,
-                max_host_mem=verb.max_host_mem,
-                cache=verb.cache,
-                scratch=verb.scratch,
-                run=run,
-                resume=run.resuming,
-                on_plan=print_plan,
-                on_step=progress,
-                between=between,
-            )
-    except KeyboardInterrupt as error:
-        steps = run.checkpoints()
-        at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
-        error.args = (f"{at}; go on with: {run.resume_command}",)
-        raise
 
 
 def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run | None) -> tuple[Scene, TrainConfig]:

@@ -105,14 +105,20 @@ def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collect
     """
     if expected := misfit(int, passes) or ("" if passes >= 1 else "at least 1"):
         raise InputError(f"--passes {passes}: expected {expected}")
-    factor = passes * photographs / config.iterations
+    return stretched(config, passes * photographs, [name for name in STEP_SETTINGS if name not in given])
+
+
+def stretched(config: TrainConfig, iterations: int, names: Collection[str] = STEP_SETTINGS) -> TrainConfig:
+    """Stretch or shorten the schedule in `config` to `iterations` steps. A setting of at least 1 stays at least 1.
+
+    names: the settings to multiply, of STEP_SETTINGS.
+    """
+    factor = iterations / config.iterations
 
     def scaled(steps: int) -> int:
         return max(round(factor * steps), 1) if steps else 0
 
-    for name in STEP_SETTINGS:
-        if name in given:
-            continue
+    for name in names:
         steps = attrgetter(name)(config)
         value = tuple(sorted({scaled(step) for step in steps})) if isinstance(steps, tuple) else scaled(steps)
         config = config.changed(name, value)

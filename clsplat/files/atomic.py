@@ -63,7 +63,21 @@ def is_abandoned(path: Path, token: str) -> bool:
         except PermissionError:
             pass
         return False
-    return time.time() - path.stat().st_mtime > ABANDONED_FILE_SECONDS
+    return is_older(path, ABANDONED_FILE_SECONDS)
+
+
+def is_older(path: Path, seconds: float) -> bool:
+    """True if a file was last changed more than `seconds` ago, by the clock of its file system. Raises OSError.
+
+    On a shared folder this machine's clock may be minutes ahead. Another machine's new file would then count as old, so
+    a new file is made in the folder to compare with. If the folder cannot be written, this machine's clock counts.
+    """
+    changed = path.stat().st_mtime
+    if time.time() - changed <= seconds:
+        return False
+    with suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, prefix=".clsplat-clock-") as probe:
+        return os.fstat(probe.fileno()).st_mtime - changed > seconds
+    return True
 
 
 def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:

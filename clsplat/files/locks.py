@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from clsplat.files.atomic import ABANDONED_FILE_SECONDS, TEMPORARY_NAME, is_abandoned, machine_mark, remove
+from clsplat.files.atomic import ABANDONED_FILE_SECONDS, TEMPORARY_NAME, is_abandoned, is_older, machine_mark, remove
 from clsplat.files.names import ON_WINDOWS
 
 EMPTY_CLAIM_SECONDS = 20
@@ -70,17 +70,23 @@ def claim(target: Path) -> Path | None:
     return None
 
 
+def is_claimed(target: Path) -> bool:
+    """True if a process has the claim of `target`, which is not abandoned. Raises OSError, but not if it is missing."""
+    with suppress(FileNotFoundError):
+        return not _is_given_up(_claim_of(target))
+    return False
+
+
 def _claim_of(target: Path) -> Path:
     return target.with_name(f".{target.name}{CLAIM_SUFFIX}")
 
 
 def _is_given_up(claimed: Path) -> bool:
-    age = time.time() - claimed.stat().st_mtime
-    if age > ABANDONED_FILE_SECONDS:
+    if is_older(claimed, ABANDONED_FILE_SECONDS):
         return True
     token = claimed.read_text(encoding="ascii", errors="replace")
     if not token:  # the marker is being written now, or its process was killed while it wrote
-        return age > EMPTY_CLAIM_SECONDS
+        return is_older(claimed, EMPTY_CLAIM_SECONDS)
     # the marker is from this process, or (in a container) from an earlier process with the same id
     if token[:12] == f"{machine_mark()}{os.getpid():08x}":
         return token[12:] != _PROCESS_TOKEN

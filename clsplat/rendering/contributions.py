@@ -6,7 +6,7 @@ The pruning: `training/density/adaptive.py`; its threshold: `config/training.py`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -35,6 +35,19 @@ def largest_contributions(
     It is 0 if the camera does not see the Gaussian. The kernel blend_grad computes contributions, whatever the
     gradient of the image is. Raises CapacityError if the device's memory is too small.
     """
+    largest = np.zeros(len(gaussians), np.float32)
+    for contributions in contributions_by_camera(gaussians, cameras, device, config):
+        largest = np.fmax(largest, contributions)
+    return largest
+
+
+def contributions_by_camera(
+    gaussians: Gaussians, cameras: Sequence[Camera], device: Device, config: RasterizerConfig | None = None
+) -> Iterator[Float32]:
+    """Yield each Gaussian's contribution (n,) to the image of each camera, in pixels, as in `largest_contributions`.
+
+    Raises CapacityError if the device's memory is too small.
+    """
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # contributions do not depend on colour
     plan = plan_step(device, len(gaussians), 1, cameras, config, StepMemory(CONTRIBUTION_SLOT_FIELDS))
@@ -43,11 +56,8 @@ def largest_contributions(
     model = host_gaussians(alpha_alone, plan.rows) if plan.streamed else upload_gaussians(device, alpha_alone)
     background = allocate(device, (3,), np.float32)
     background.fill(0.0)
-    largest = np.zeros(len(gaussians), np.float32)
     for camera in cameras:
-        frame = rasterizer.forward(model, gaussians.local(camera), background)
-        largest = np.fmax(largest, sums_of_weights(rasterizer, frame))
-    return largest
+        yield sums_of_weights(rasterizer, rasterizer.forward(model, gaussians.local(camera), background))
 
 
 def sums_of_weights(rasterizer: Rasterizer, frame: ForwardPass) -> Float32:

@@ -86,6 +86,23 @@ def plan_step(
 ) -> Plan:
     """Plan the device memory for a training step with any of the cameras. Raises CapacityError.
 
+    Arguments as for `step_need`.
+    """
+    return _plan(device, step_need(device, gaussians, coefficients, cameras, config, step, models=models))
+
+
+def step_need(
+    device: Device,
+    gaussians: int,
+    coefficients: int,
+    cameras: Iterable[Camera],
+    config: RasterizerConfig,
+    step: StepMemory,
+    *,
+    models: int = MODELS,
+) -> Need:
+    """Return the device memory that a training step with any of the cameras needs, whatever the device's limit is.
+
     coefficients: number of SH coefficients per colour channel.
     models: number of arrays per parameter. The default is the number for a step of one view.
     """
@@ -101,7 +118,7 @@ def plan_step(
     appends = device.shape.items > 1 and device.memory.limit is None
     screen = project.SCREEN_GRADIENT_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(contributions=fields.contributions)
-    need = replace(
+    return replace(
         frame,
         row=frame.row + screen + statistics + (_VISIBLE_MARK_BYTES if models > MODELS else 0) + step.row_bytes,
         banded=frame.banded + 4 * fields.floats,
@@ -116,7 +133,6 @@ def plan_step(
         pool=step.pool,
         in_view=step.in_view,
     )
-    return _plan(device, need)
 
 
 def plan_view(device: Device, previous: Plan, in_view: int) -> Plan:

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float32, Float64
+from clsplat.config.colour_models import ColourModel
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import parse_json, read_document
 from clsplat.images.alpha import Image
@@ -92,6 +94,62 @@ def held_out_looks(record: Mapping[str, Any] | None) -> Look:
     does not list the photograph.
     """
     return _looks(_rows_in(record, "held_out") if record is not None else {})
+
+
+def entries_of(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Float64, Float64]:
+    """Return what the run in `folder` has learnt of photographs: their entries, and those of their lenses.
+
+    names: the photographs' names.
+    Returns arrays (photographs, model.entries) and (photographs, model.lens_entries). Raises InputError.
+    """
+    path, record = _learnt(folder, model.stem, names)
+    try:
+        rows = [record["photographs"][name] for name in names]
+        tables = [
+            np.array([[number for part in parts for number in row[part]] for row in rows], np.float64)
+            for parts in (model.of_photograph, model.of_lens)
+        ]
+        for table, columns in zip(tables, (model.entries, model.lens_entries), strict=True):
+            if table.shape != (len(names), columns) or not (np.abs(table) <= MAX_LOG2_GAIN).all():
+                raise ValueError(
+                    f"expected {columns} numbers a photograph from {-MAX_LOG2_GAIN:g} to {MAX_LOG2_GAIN:g}"
+                )
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise _misread(path, error) from None
+    return tables[0], tables[1]
+
+
+def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...]) -> Float32:
+    """Return the bilateral grids (photographs, *shape) that the run in `folder` has learnt of photographs.
+
+    names: the photographs' names. Raises InputError.
+    """
+    path, record = _learnt(folder, "grid", names)
+    arrays = path.with_suffix(".npz")
+    try:
+        rows = [int(record["photographs"][name]["grid"]) for name in names]
+        with np.load(arrays, allow_pickle=False) as file:
+            grids = file["grids"]
+        if grids.shape[1:] != shape or grids.dtype != np.float32 or not np.isfinite(grids).all() or min(rows) < 0:
+            raise ValueError(f"grids have shape {grids.shape}, expected finite float32 of (photographs, *{shape})")
+        return np.ascontiguousarray(grids[rows])
+    except (ValueError, TypeError, KeyError, IndexError, OSError, BadZipFile, OverflowError) as error:
+        raise _misread(arrays, error) from None
+
+
+def _learnt(folder: Path, kind: str, names: Sequence[str]) -> tuple[Path, Any]:
+    """Return path and content of a run's appearance.json. Raises InputError if it is of another kind, or lacks
+    photographs."""
+    path = folder / "appearance.json"
+    if not path.exists():
+        raise InputError(f"{path}: no such file, expected a finished run of clsplat train --appearance {kind}")
+    record = _document(path)
+    if not isinstance(record, dict) or record.get("kind") != kind or not isinstance(record.get("photographs"), dict):
+        was = record.get("kind") if isinstance(record, dict) else None
+        raise InputError(f"{path}: is of --appearance {was}, expected --appearance {kind}")
+    if missing := [name for name in names if name not in record["photographs"]]:
+        raise InputError(f"{path}: lacks {len(missing)} of {len(names)} photographs ({examples(missing)})")
+    return path, record
 
 
 def _looks(rows: Mapping[str, Row]) -> Look:

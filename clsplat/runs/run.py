@@ -11,7 +11,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -87,18 +87,21 @@ class Run:
         scene: str | os.PathLike[str] | None = None,
         resume: bool = False,
         overwrite: bool = False,
+        beside: Collection[str] = (),
     ) -> Run:
         """Make the run folder and its config.toml, which records `scene` as an absolute path.
 
         resume: continue an existing run with `config` (see `check_resumed`).
         overwrite: remove the files of an existing run, and nothing else.
+        beside: names of other files and folders that may be in the folder.
         Raises InputError like `check_output`, `check_resumed` and `locks.locked`.
         """
         path = Path(path)
-        check_output(path, resume=resume, overwrite=overwrite)
+        check_output(path, resume=resume, overwrite=overwrite, beside=beside)
         path.mkdir(parents=True, exist_ok=True)
         with locked(path, "train"):
-            check_output(path, resume=resume, overwrite=overwrite)  # check again: another process may have made a run
+            # check again, because another process may have made a run
+            check_output(path, resume=resume, overwrite=overwrite, beside=beside)
             if resume:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)
@@ -361,11 +364,12 @@ def run_of(model: Path) -> Run | None:
     return next((Run.open(path) for path in (model, model.parent) if is_run(path)), None)
 
 
-def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
+def check_output(path: Path, *, resume: bool, overwrite: bool, beside: Collection[str] = ()) -> None:
     """Raise InputError if a run cannot be created at `path`.
 
     resume: True to check instead if the run at `path` can be resumed.
     overwrite: True to allow an existing run, whose files are then replaced.
+    beside: names of other files and folders that may be at `path`.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
@@ -377,7 +381,8 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
         if not (resume or overwrite):
             raise InputError(f"{path}: is already a run, use --resume to go on with it or --overwrite to replace it")
     elif path.is_dir():
-        foreign = sorted(entry.name for entry in path.iterdir() if not entry.name.startswith("."))
+        names = (entry.name for entry in path.iterdir() if entry.name not in beside)
+        foreign = sorted(name for name in names if not name.startswith("."))
         if foreign:
             raise InputError(f"{path}: is not a run but has files ({foreign[0]}), expected an empty or new folder")
 

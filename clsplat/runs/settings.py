@@ -67,8 +67,14 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
     document: dict[str, Any] = {"clsplat": package_version()}
     if scene is not None:
         document["scene"] = str(scene)
-    document["train"] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # NumPy to Python
+    document["train"] = table_of(config)
     return tomli_w.dumps(document)
+
+
+def table_of(config: TrainConfig) -> dict[str, Any]:
+    """Return settings as values that TOML and JSON can hold, by name; each group of settings is a table of its own."""
+    table: dict[str, Any] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # from NumPy
+    return table
 
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
@@ -94,15 +100,25 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
     scene = document.get("scene")
     if scene is not None and not (isinstance(scene, str) and scene):
         raise InputError(f"{path}: scene is {scene!r}, expected the scene's path as text")
+    config = config_of(document.get("train", {}), path)
+    return config, Path(scene) if scene is not None else None
+
+
+def config_of(table: Any, path: Path) -> TrainConfig:
+    """Return the settings in a table as from `table_of`. Warns of ignored settings of earlier versions.
+
+    path: path of the file that holds the table, for messages.
+    Raises InputError.
+    """
     passed_over: list[str] = []
-    config = _from_table(TrainConfig, document.get("train", {}), path, "train", passed_over)
+    config = _from_table(TrainConfig, table, path, "train", passed_over)
     if passed_over:
         _warn_once(plain(f"{path}: has settings that this version lacks, which are ignored: {', '.join(passed_over)}"))
     try:
         config.check()
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return config, Path(scene) if scene is not None else None
+    return config
 
 
 def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: list[str]) -> T:

@@ -199,6 +199,7 @@ class Scene:
     world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
     file_unit: length of a unit of the scene's files, in world units.
     georeference: where the scene lies on the earth; None if it is unknown.
+    whole_extent: extent of the scene of which this is a part; None if it is no part.
     """
 
     name: str
@@ -218,6 +219,7 @@ class Scene:
     world_from_files: Float64 | None = None
     file_unit: float = 1.0
     georeference: Georeference | None = None
+    whole_extent: float | None = None
 
     @cached_property
     def train_views(self) -> list[View]:
@@ -331,8 +333,11 @@ class Scene:
         """The scene's size in world units, as cameras_extent in the 3DGS authors' code.
 
         It is 1.1 times the distance of the farthest training camera from the cameras' mean, without outliers. If all
-        cameras are in one place, it is the median distance of the points from there, or 1 without points.
+        cameras are in one place, it is the median distance of the points from there, or 1 without points. A part of a
+        scene has the extent of the whole.
         """
+        if self.whole_extent is not None:
+            return self.whole_extent
         middle, spread, _ = self.spread
         if not self.in_one_place:
             return 1.1 * spread

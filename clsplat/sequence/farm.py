@@ -6,21 +6,18 @@ A frame is a Dask task. Every worker loads the model once and keeps it. Files mu
 
 from __future__ import annotations
 
-import logging
-import signal
 import threading
-import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.errors import ClsplatError, InputError, warn
+from clsplat.errors import ClsplatError, InputError
 from clsplat.images.video import VideoWriter
+from clsplat.jobs.dask_cluster import dask_client, warning_of_no_workers
 from clsplat.sequence.finished_frames import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
 from clsplat.sequence.job_models import load_job_models, names_of
@@ -28,14 +25,8 @@ from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import WRITE_QUEUE_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
 from clsplat.version import package_version
 
-LOCAL_WORKER_THREADS = 2
-"""Number of threads of a local worker: one frame is encoded while the next is rendered."""
 MAX_FRAMES_PER_WORKER = 3
 """Largest number of frames that a worker has in memory at once, even if it has more threads."""
-SCHEDULER_TIMEOUT_SECONDS = 20
-"""Seconds within which a scheduler has to answer."""
-NO_WORKERS_WARNING_SECONDS = 10.0
-"""Seconds between warnings while a scheduler has no workers."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +144,7 @@ def render_on_farm(
         raise ValueError("job.options.channels is empty, expected at least one channel")
     placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
     names = {task.key: str(task.path) for task in tasks}
-    with _client(scheduler, workers) as client, _telling_of_no_workers(client, scheduler):
+    with dask_client(scheduler, workers) as client, warning_of_no_workers(client, scheduler, "frames"):
         results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.key]))
@@ -201,80 +192,3 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
         for another in submit((done if video is None else video.frames) + window - sent):
             pending.add(another)
             sent += 1
-
-
-@contextmanager
-def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]:
-    """Warn at once, and then at intervals, while the scheduler has no workers. Does nothing for a local cluster."""
-    if scheduler is None:
-        yield
-        return
-    stop = threading.Event()
-
-    def watch() -> None:
-        since: float | None = None
-        while not stop.is_set():
-            try:
-                there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # `_results` reports a lost scheduler
-                return
-            now = time.monotonic()
-            since = None if there else since or now
-            if since is not None and not stop.is_set():
-                waited = f", for {now - since:.0f} s now" if now - since >= 1 else ""
-                warn(
-                    f"--scheduler {scheduler}: has no workers{waited}; frames wait until one connects; start one with: "
-                    f"dask worker {scheduler}"
-                )
-            stop.wait(NO_WORKERS_WARNING_SECONDS)
-
-    watcher = threading.Thread(target=watch, name="clsplat-farm", daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        watcher.join(NO_WORKERS_WARNING_SECONDS)
-
-
-def dask_setup(_: Any) -> None:
-    """Ignore Ctrl-C in a worker on this machine: the job reacts to it. Dask calls this when a worker starts."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-@contextmanager
-def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
-    try:
-        import dask
-        import distributed
-    except ImportError:
-        flag = "--scheduler" if scheduler else "--workers"
-        raise InputError(
-            f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
-        ) from None
-    # silence Dask, which logs every lost worker in many lines; errors that matter are raised
-    for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    if scheduler is not None:
-        try:
-            client = distributed.Client(scheduler, timeout=SCHEDULER_TIMEOUT_SECONDS, set_as_default=False)
-        except (OSError, ValueError, RuntimeError) as error:
-            reason = str(error).partition("\n")[0] or type(error).__name__
-            raise InputError(f"--scheduler {scheduler}: no scheduler answers there: {reason}") from None
-        with client:
-            yield client
-        return
-    with (
-        dask.config.set({"distributed.worker.daemon": True, "distributed.worker.multiprocessing-method": "spawn"}),
-        distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=LOCAL_WORKER_THREADS,
-            processes=True,
-            memory_limit=None,  # by default Dask would kill workers with a large model
-            dashboard_address=None,
-            preload=[__name__],
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client

@@ -1,29 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames shared by jobs that run at the same time. Before a job renders a frame, it checks the frame's file again, and
-claims the frame by a claim file next to it.
-
-`clsplat.files.locks` decides when another job takes over the claim of a killed job: at once on the same machine, and
-after ABANDONED_FILE_SECONDS without an update on another machine.
+claims the frame by a claim file next to it (`clsplat.jobs.claims`).
 """
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
-from pathlib import Path
 from typing import Literal
 
 from clsplat.errors import warn
-from clsplat.files.locks import claim, give_back
+from clsplat.jobs.claims import HeldClaims
 from clsplat.sequence.finished_frames import is_complete
 from clsplat.sequence.task import RenderOptions, Task
 
-CLAIM_HEARTBEAT_SECONDS = 60.0
-"""Seconds between updates of a claim file's modification time, so that it stays younger than ABANDONED_FILE_SECONDS."""
 CLAIM_POLL_SECONDS = 0.25
 """Seconds between checks of frames that other jobs have claimed."""
 CLAIM_WARNING_SECONDS = 10.0
@@ -35,10 +27,7 @@ class Sharing:
     """The frames that this job has claimed, so that no other job renders them. All methods are thread-safe."""
 
     def __init__(self, options: RenderOptions) -> None:
-        self.options = options
-        self._claims: dict[str, Path] = {}
-        self._changing, self._closed = threading.Lock(), threading.Event()
-        threading.Thread(target=self._hold, name="clsplat-claims", daemon=True).start()
+        self.options, self._claims = options, HeldClaims()
 
     def begin(self, task: Task) -> State:
         """Claim a frame if possible. Returns one of three words:
@@ -49,38 +38,20 @@ class Sharing:
         """
         if is_complete(task, self.options):
             return "done"
-        if (claimed := claim(task.path)) is None:
+        if not self._claims.take(task.path):
             return "theirs"
         if is_complete(task, self.options):  # completed by another job just before the claim
-            give_back(claimed)
+            self._claims.release(task.path)
             return "done"
-        with self._changing:
-            self._claims[task.key] = claimed
         return "ours"
-
-    def _hold(self) -> None:
-        """Update the claim files' modification times while the job runs, because a frame may take hours."""
-        while not self._closed.wait(CLAIM_HEARTBEAT_SECONDS):
-            with self._changing:
-                for claimed in self._claims.values():
-                    with suppress(OSError):
-                        os.utime(claimed)  # unlike Path.touch, does not create a missing file
 
     def end(self, task: Task) -> None:
         """Give up the claim of a frame, whether the frame's file has been completed or not."""
-        with self._changing:
-            claimed = self._claims.pop(task.key, None)
-        if claimed is not None:
-            give_back(claimed)
+        self._claims.release(task.path)
 
     def close(self) -> None:
         """Give up the claims of all unfinished frames."""
-        self._closed.set()
-        with self._changing:
-            claims, self._claims = list(self._claims.values()), {}
-        for claimed in claims:
-            with suppress(OSError):
-                give_back(claimed)
+        self._claims.close()
 
 
 class FrameQueue:

@@ -20,7 +20,7 @@ def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) 
     """
     cooled, given = _cooled(config, step), vars(config.optimiser)
     rates = {name: given[setting] * cooled * factor for name, setting in _RATE_SETTINGS.items()}
-    rates["means"] = _means_rate(config, step) * length_unit * cooled * factor
+    rates["means"] = means_rate_at(config, step) * length_unit * cooled * factor
     return rates
 
 
@@ -31,7 +31,7 @@ def largest_rates(config: TrainConfig, steps: range, length_unit: float) -> dict
     because it rises or falls all the way.
     """
     rates, cooled = rates_at(config, steps[0], length_unit, 1.0), _cooled(config, steps[0])
-    rates["means"] = max(rates["means"], _means_rate(config, steps[-1]) * length_unit * cooled)
+    rates["means"] = max(rates["means"], means_rate_at(config, steps[-1]) * length_unit * cooled)
     return rates
 
 
@@ -42,7 +42,7 @@ def _cooled(config: TrainConfig, step: int) -> float:
     return config.optimiser.cooldown_to ** (into / cooldown) if into > 0 else 1.0
 
 
-def _means_rate(config: TrainConfig, step: int) -> float:
+def means_rate_at(config: TrainConfig, step: int) -> float:
     """The means' learning rate in a scene of length unit 1, before the cooldown."""
     optimiser = config.optimiser
     fraction = min(step / optimiser.means_rate_steps, 1.0)

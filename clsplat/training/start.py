@@ -26,11 +26,13 @@ class Start:
     region: the region in which the training changes Gaussians. None means everywhere.
     appearance_of: folder of a run whose appearance is used for photographs of the same name, and is not trained. None
         means that the training has an appearance of its own.
+    trains_appearance: True to train the appearance from where `appearance_of` has it.
     """
 
     model: Gaussians | None = None
     region: TrainedRegion | None = None
     appearance_of: Path | None = None
+    trains_appearance: bool = False
 
 
 NO_START = Start()

@@ -107,6 +107,8 @@ class Trainer:
         self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
         initial = self.begins_with.model or from_scene(self.scene, self.config.random_points, self.position.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
+        if (earlier := self.begins_with.appearance_of) is not None:
+            self.appearance.begin_from(earlier, fixed=not self.begins_with.trains_appearance)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near, region = initial.origin, self.scene.near, self.begins_with.region
         self.region = None if region is None else region.relative_to(self.origin)

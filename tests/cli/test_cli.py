@@ -15,9 +15,9 @@ from fakes import Pipeline
 
 from clsplat.cli.eval import EvalVerb
 from clsplat.cli.main import main, parse
-from clsplat.cli.options import SeveralDevices
 from clsplat.cli.session import Services
 from clsplat.cli.train import TrainVerb
+from clsplat.cli.training_run import TrainingMachine
 from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError
@@ -57,7 +57,7 @@ def test_flags_become_the_config() -> None:
     line = "train S -o R --iterations 50 --eval-at 10,20,30 --warmup 5 --optimiser.beta1 0.8 --density.every 0"
     verb = parse([*line.split(), "--density.absolute-gradients", "--background", "random", "--device", "gpu"])
     assert isinstance(verb, TrainVerb)
-    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), SeveralDevices("gpu"))
+    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), TrainingMachine("gpu"))
     config = verb.config
     assert (config.iterations, config.eval_at, config.warmup) == (50, (10, 20, 30), (5,))
     assert (config.optimiser.beta1, config.density.every, config.density.absolute_gradients) == (0.8, 0, True)

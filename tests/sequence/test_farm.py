@@ -27,6 +27,7 @@ from clsplat.cli.main import main
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.files.documents import digest
+from clsplat.jobs import dask_cluster
 from clsplat.sequence import farm
 from clsplat.sequence.finished_frames import stamp
 from clsplat.sequence.shot_tasks import make_tasks
@@ -153,7 +154,7 @@ def test_a_frame_that_fails_ends_the_job(
 
 @pytest.mark.needs("distributed")
 def test_no_scheduler(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(farm, "SCHEDULER_TIMEOUT_SECONDS", 1)
+    monkeypatch.setattr(dask_cluster, "SCHEDULER_TIMEOUT_SECONDS", 1)
     assert render(shot, tmp_path, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert "--scheduler tcp://127.0.0.1:9: no scheduler answers there" in error_line(capsys)
     assert render(shot, tmp_path, "--scheduler", "nonsense://x") == 2
@@ -168,7 +169,7 @@ def test_a_scheduler_without_workers(
     """It is said at once and again, until a worker comes, who does the work."""
     import distributed
 
-    monkeypatch.setattr(farm, "NO_WORKERS_WARNING_SECONDS", 1.0)
+    monkeypatch.setattr(dask_cluster, "NO_WORKERS_WARNING_SECONDS", 1.0)
     with distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None) as empty:
         come = threading.Timer(4.0, lambda: empty.scale(1))
         come.start()

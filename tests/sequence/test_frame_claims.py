@@ -18,6 +18,7 @@ from test_render_job import OPTIONS, rendered, tasks_in
 
 from clsplat.files import atomic, locks
 from clsplat.files.locks import abandoned, claim, give_back
+from clsplat.jobs import claims
 from clsplat.sequence import frame_claims, workers
 from clsplat.sequence.finished_frames import is_complete, remove_temporaries
 from clsplat.sequence.frame_claims import Sharing
@@ -80,7 +81,7 @@ def test_a_process_of_the_same_number_before_this_one(tmp_path: Path, monkeypatc
 
 
 def test_claims_are_touched_while_a_job_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_claims, "CLAIM_HEARTBEAT_SECONDS", 0.02)
+    monkeypatch.setattr(claims, "CLAIM_HEARTBEAT_SECONDS", 0.02)
     (task,) = tasks_in(tmp_path, 1)
     shared = Sharing(OPTIONS)
     assert shared.begin(task) == "ours"

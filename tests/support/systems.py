@@ -37,3 +37,13 @@ def locked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals, pipes or file modes")
 links = pytest.mark.skipif(not can_link(), reason="this user may not make symbolic links")
+
+
+def alive(pid: int) -> bool:
+    """True if a process runs; a process that has ended but was not waited for does not."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    stat = Path(f"/proc/{pid}/stat")
+    return not (stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z")

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from quality.blocks import blocks
 from quality.camera_choices import cameras as sfm_cameras
 from quality.made_scenes import (
     Changes,
@@ -432,6 +433,15 @@ TOWNS = {
     "--own-block": {"action": "store_true", "help": "photographs of --towns count where they show their own block"},
     "--passes": _number(30, "passes through the photographs, if --iterations is 0"),
 }
+BLOCKS = {
+    "--town": {"default": "2x2"},
+    "--town-photos": _number(40, "photographs a block of the town"),
+    "--town-size": {"default": "320x200", "help": "size of the photographs"},
+    "--blocks": {"default": "2x2", "help": "as for `clsplat train`"},
+    "--gaussians": _number(20_000, "largest number of Gaussians"),
+    "--sky": _number(3000, "Gaussians of the sky"),
+    "--exposure": _number(0.0, "stops of the town whose exposure drifts; 0: no such town"),
+}
 CAMERAS: dict[str, Any] = {
     "--choices": {"default": "auto", "help": "'matching=exhaustive,mapper=global;auto', with semicolons between"},
     "--threads": {"type": int, "help": "threads of `clsplat sfm`; one per core if not given"},
@@ -448,6 +458,7 @@ EXPERIMENTS = {
     "seeds": Experiment(seeds, "+", 2000, {**RESOLUTION, **WITH, **SEEDS}),
     "orders": Experiment(orders, "+", 3000, {**RESOLUTION, **WITH, **SEEDS}),
     "towns": Experiment(towns, 0, 0, {**WITH, **TOWNS}),
+    "blocks": Experiment(blocks, 0, 4000, {**RESOLUTION, **WITH, **BLOCKS}),
     "sfm": Experiment(sfm_cameras, "+", 2000, {**RESOLUTION, **CAMERAS}),
     "formats": Experiment(
         survey_formats, 1, 1000, {**RESOLUTION, **WITH, "--bound": _number(0.05, "largest difference in dB")}

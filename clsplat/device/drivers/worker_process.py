@@ -15,12 +15,11 @@ import time
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from clsplat.errors import DriverError, InputError, switched_on
-from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings
+from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings, module_command
 
 CHILD_MESSAGE_PREFIX = "clsplat-child "
 """Prefix of the lines in which a worker process sends messages, to distinguish them from lines that a driver prints."""
@@ -230,17 +229,10 @@ _NO_PYTHON_ADVICE = (
 
 
 def python_module(module: str, *words: str) -> list[str]:
-    """Return the command that runs a module of this package with the arguments `words`.
+    """Return the result of `clsplat.process.module_command`.
 
-    Unlike `python -m`, the command imports nothing from the current folder. Raises DriverError if Python does not know
-    the path of its executable.
+    Raises DriverError if Python does not know the path of its executable.
     """
     if not sys.executable:  # it is empty in a program that embeds Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
-    root = str(Path(__file__).resolve().parents[3])
-    code = (
-        f"import sys; sys.path[:] = [part for part in sys.path if part]; root = {root!r}; "
-        "sys.path[:0] = [] if root in sys.path else [root]; "
-        f"import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
-    )
-    return [sys.executable, "-c", code, *words]
+    return module_command(module, *words)

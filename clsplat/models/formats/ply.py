@@ -92,7 +92,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest)
         _convert_colours(gaussians, vertex)
         if header.origin is not None:
-            _subtract_origin(header.origin, gaussians, _local_means(file, header), path)
+            _subtract_origin(header.origin, gaussians, _local_means(file, header, 0, vertex.count), path)
         gaussians.near, gaussians.antialiased, gaussians.by_rays = header.near, header.is_antialiased(), header.by_rays
         return gaussians
 
@@ -135,6 +135,26 @@ def blocks(path: Path) -> Iterator[Gaussians]:
             gaussians = replace(values.empty(len(block["x"]), _degree(rest)), origin=origin)
             _fill(gaussians, block, rest)
             yield gaussians
+
+
+def local_blocks(path: Path) -> Iterator[Gaussians]:
+    """Yield the Gaussians in blocks of rows, in the file's order, with the exact means that `read` returns.
+
+    The means of each block are relative to the block's `origin`. Non-finite values, and colours named as in
+    RGB_PROPERTY_NAMES, are not converted. Raises InputError like `read`.
+    """
+    with open_input(path, "a 3DGS PLY") as file, open_input(path, "a 3DGS PLY") as of_means:
+        header = read_header(file, path)
+        rest, start = _check_properties(header), 0
+        antialiased = header.is_antialiased()
+        for block in read_vertices(file, header, "Gaussian") if header.vertex.count else ():
+            gaussians = values.empty(len(block["x"]), _degree(rest))
+            _fill(gaussians, block, rest)
+            if header.origin is not None:
+                local = _local_means(of_means, header, start, len(gaussians))
+                _subtract_origin(header.origin, gaussians, local, path)
+            start += len(gaussians)
+            yield replace(gaussians, near=header.near, antialiased=antialiased, by_rays=header.by_rays)
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -184,6 +204,31 @@ def write_rows(
     model: Gaussians with the origin, near plane, SH degree and other properties of the whole model.
     rows: function that returns the Gaussians [start, stop).
     """
+    slices = [(block.start, block.stop) for block in values.row_blocks(count, IO_BLOCK_ROWS)]
+    write_blocks(
+        path,
+        model,
+        count,
+        lambda: (rows(start, stop) for start, stop in slices),
+        sh_degree=sh_degree,
+        comments=comments,
+    )
+
+
+def write_blocks(
+    path: str | os.PathLike[str],
+    model: Gaussians,
+    count: int,
+    blocks: Callable[[], Iterable[Gaussians]],
+    *,
+    sh_degree: int | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write a model of `count` Gaussians like `write_rows`, from blocks of rows of any size.
+
+    model: Gaussians with the origin, near plane, SH degree and other properties of the whole model.
+    blocks: function that returns all Gaussians of the model in blocks, in order. A second call returns the same.
+    """
     check_comments(comments)
     degree = model.sh_degree if sh_degree is None else sh_degree
     if misfit(int, degree) or not model.sh_degree <= degree <= MAX_SH_DEGREE:
@@ -202,12 +247,12 @@ def write_rows(
         *ROTATION_PROPERTIES,
     ]
     far, head = bool(model.origin.any()), _header(model, count, names, comments)
-    blocks = [(block.start, block.stop) for block in values.row_blocks(count, IO_BLOCK_ROWS)]
+    first = 0
     with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
         file.write(head)
-        for start, stop in blocks:
-            some = rows(start, stop)
-            values.check_writable(Path(path), some, first=start)
+        for some in blocks():
+            values.check_writable(Path(path), some, first=first)
+            first += len(some)
             block = np.zeros((len(some), len(names)), "<f4")
             block[:, 0:3] = some.means + model.origin if far else some.means
             block[:, 6:9] = some.sh[:, 0]
@@ -217,8 +262,8 @@ def write_rows(
             block[:, -7:-4] = some.log_scales
             block[:, -4:] = some.quaternions
             file.write(block.data)
-        for start, stop in blocks if far else ():
-            file.write(np.ascontiguousarray(rows(start, stop).means, "<f4").data)
+        for some in blocks() if far else ():
+            file.write(np.ascontiguousarray(some.means, "<f4").data)
 
 
 def _header(gaussians: Gaussians, count: int, names: Sequence[str], comments: Sequence[str]) -> bytes:
@@ -247,8 +292,8 @@ def check_comments(comments: Sequence[str]) -> None:
             raise ValueError(f"comment is {line!r}, expected one line of ASCII")
 
 
-def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
-    """Read the exact means (n, 3) from the element LOCAL_MEANS_ELEMENT.
+def _local_means(file: BinaryIO, header: PlyHeader, first: int, count: int) -> Float32 | None:
+    """Read `count` exact means (count, 3) from the element LOCAL_MEANS_ELEMENT, from row `first` on.
 
     Returns None if this element does not follow the vertices, and for an ascii file.
     Raises InputError if the file ends within the element.
@@ -257,9 +302,9 @@ def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
     behind = len(header.before) + 1
     if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:
         return None
-    file.seek(header.start(behind))
     row = header.row_type(wanted)
-    need = wanted.count * row.itemsize
+    file.seek(header.start(behind) + first * row.itemsize)
+    need = count * row.itemsize
     data = file.read(need)
     if len(data) != need:
         raise InputError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
@@ -40,6 +41,13 @@ class Appearance(Component):
         if not shares:
             return inputs
         return [replace(each, parts=(*each.parts, share)) for each, share in zip(inputs, shares, strict=True)]
+
+    def begin_from(self, folder: Path, *, fixed: bool) -> None:
+        """Begin with the appearance that the run in `folder` has learnt, by the names of the photographs.
+
+        fixed: True if the appearance stays as it is.
+        Raises InputError if the run has not learnt this appearance of all training photographs.
+        """
 
     def record(self) -> dict[str, Any] | None:
         """Return the content of appearance.json; None if no appearance is learnt."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
+from clsplat.runs.appearance import grids_of
 from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, device_bytes, grid_gradient, step_grid
 from clsplat.training.appearance.base import Appearance
 from clsplat.training.appearance.schedule import loaded, rate_at, saved
@@ -41,6 +43,7 @@ class ViewGrid(ViewPart):
     rate: learning rate of the grid in this step.
     ends: True if a pass through all training views ends with this view.
     place: the view's position in the batch.
+    fixed: True if the grid is not learnt.
     """
 
     device: Device
@@ -50,6 +53,7 @@ class ViewGrid(ViewPart):
     rate: float
     ends: bool
     place: int = 0
+    fixed: bool = False
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGrid:
         """Return this part with its grid on another device, to apply the grid there and to compute its gradient.
@@ -70,8 +74,8 @@ class ViewGrid(ViewPart):
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
-    ) -> DeviceArray:
-        """Return the loss's gradient with respect to the grid.
+    ) -> DeviceArray | None:
+        """Return the loss's gradient with respect to the grid; None if the grid is not learnt.
 
         image: the render before `compare`. size: its width and height.
         gradient: the loss's gradient with respect to the result of `compare`. It is replaced, in place, by the gradient
@@ -80,6 +84,8 @@ class ViewGrid(ViewPart):
         """
         of_view = (self.grids, self.view, image, gradient)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
+        if self.fixed:
+            return None
         if self.visit == 1:
             with only_tried(self.device):
                 replace(self, ends=True).update(by_grid, by_grid)
@@ -89,10 +95,11 @@ class ViewGrid(ViewPart):
         """Take Adam's step for the grid. After a pass through all views, also shift all grids so that their mean is the
         identity: a colour change that all photographs share belongs to the model.
 
-        own: gradient with respect to the grid, as the method `gradient` returned it.
+        own: gradient with respect to the grid, as the method `gradient` returned it. None causes no step.
         readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
         """
-        assert own is not None, "made by `gradient`"
+        if own is None:
+            return
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
         if self.ends:
             centre_grids(self.device, self.grids, readback)
@@ -106,6 +113,16 @@ class GridsOfAll(Appearance):
         self._count = len(scene.train_views)
         start = np.broadcast_to(np.eye(3, 4, dtype=np.float32), (self._count, *GRID_SHAPE))
         self._grids = Grids.on(device, np.ascontiguousarray(start))
+        self._fixed = False
+
+    def begin_from(self, folder: Path, *, fixed: bool) -> None:
+        """Begin with the grids that the run in `folder` has learnt, by the names of the photographs.
+
+        fixed: True if the grids stay as they are.
+        Raises InputError if the run has no grids of this size for all training photographs.
+        """
+        names = [view.name for view in self._scene.train_views]
+        self._grids, self._fixed = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE)), fixed
 
     @property
     def pixel_bytes(self) -> int:
@@ -131,6 +148,7 @@ class GridsOfAll(Appearance):
                 rate_at(self._config, number, count, ends=GRID_RATE_END_FRACTION, hastens=False),
                 number % count == 0,
                 place,
+                self._fixed,
             )
             for place, (view, number) in enumerate(zip(views, numbers, strict=True))
         ]

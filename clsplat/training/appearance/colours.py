@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.images.colour import SRGB, photos_space
 from clsplat.images.exif import exposure_of
+from clsplat.runs.appearance import entries_of
 from clsplat.scenes.analysis.visible_points import VisiblePoints
 from clsplat.stages.appearance import (
     GainEntries,
@@ -87,6 +89,7 @@ class ViewColours(ViewPart):
     taken: the photograph's row in `colours`, and its lens's row in `lenses`.
     rate, lens_rate: learning rates of the photograph's entries, and of the lens's entries.
     place: the view's position in the batch.
+    fixed: True if the entries are not learnt.
     """
 
     device: Device
@@ -98,6 +101,7 @@ class ViewColours(ViewPart):
     rate: float
     lens_rate: float
     place: int = 0
+    fixed: bool = False
     changes_target = True
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewColours:
@@ -126,12 +130,15 @@ class ViewColours(ViewPart):
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
-    ) -> DeviceArray:
+    ) -> DeviceArray | None:
         """Return the loss's gradient with respect to the entries, as column sums (`entry_gradient`), for `update`.
+        None if the entries are not learnt.
 
         image: the render, of width and height `size`. gradient: the loss's gradient with respect to it.
         At the first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
+        if self.fixed:
+            return None
         columns = entry_gradient(self.device, work, self.model, self.taken, image, gradient, size, self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -141,10 +148,11 @@ class ViewColours(ViewPart):
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
         """Take Adam's step for the entries of the photograph and of its lens.
 
-        own: gradient with respect to the entries, as the method `gradient` returned it.
+        own: gradient with respect to the entries, as the method `gradient` returned it. None causes no step.
         readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
         """
-        assert own is not None, "made by `gradient`"
+        if own is None:
+            return
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
         step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_UPDATE)
         if self.lenses is not None:
@@ -198,12 +206,31 @@ class ColoursOfAll(Appearance):
         ]
         shape = (len(self._lens_rows), self._model.lens_entries)
         self._lenses = Gains.on(device, np.zeros(shape, np.float32)) if self._model.of_lens else None
+        self._earlier: NDArray[np.float32] | None = None
+        self._fixed = False
+
+    def begin_from(self, folder: Path, *, fixed: bool) -> None:
+        """Begin with the entries that the run in `folder` has learnt, by the names of the photographs.
+
+        fixed: True if the entries stay as they are.
+        Raises InputError if the run has not learnt this colour model of all training photographs.
+        """
+        views, model = self._scene.train_views, self._model
+        own, of_lenses = entries_of(folder, [view.name for view in views], model)
+        self._earlier, self._fixed = own.astype(np.float32), fixed
+        if self._lenses is not None:
+            values = np.zeros((len(self._lens_rows), model.lens_entries), np.float32)
+            values[[taken.lens for taken in self._taken]] = of_lenses
+            self._lenses = Gains.on(self._device, values)
 
     @cached_property
     def _gains(self) -> Gains:
         """Entries of all training photographs. The gains among them begin at gains from points or from EXIF. The
         entries are computed on first use, because sampling the photographs takes time, and a checkpoint may replace the
-        result."""
+        result. Entries of an earlier run replace the initial ones, but the pull is towards the initial ones."""
+        if self._fixed and self._earlier is not None:
+            self._by_points = np.zeros(len(self._earlier), np.bool_)
+            return Gains.on(self._device, self._earlier)
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
@@ -215,7 +242,11 @@ class ColoursOfAll(Appearance):
         start = np.zeros((len(scene.train_views), self._model.entries))
         start[:, :GAIN_ENTRIES] = [by_points.get(view.name, np.full(3, told)) for view, told in views]
         self._by_points = np.array([view.name in by_points for view in scene.train_views])
-        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), self._pull)
+        begun = Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), self._pull)
+        if self._earlier is None:
+            return begun
+        earlier = Gains.on(self._device, self._earlier)
+        return replace(begun, logs=earlier.logs, gains=earlier.gains)
 
     @property
     def _pull(self) -> csr_array:
@@ -247,6 +278,7 @@ class ColoursOfAll(Appearance):
                 rate_at(self._config, number, len(self._taken), ends=GAIN_RATE_END_FRACTION),
                 rate_at(self._config, number, len(self._lens_rows), ends=GAIN_RATE_END_FRACTION),
                 place,
+                self._fixed,
             )
             for place, (view, number) in enumerate(zip(views, numbers, strict=True))
         ]

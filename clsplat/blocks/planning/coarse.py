@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The coarse model of a whole scene: settings of its training, and the number of steps of a block and of the finish."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from clsplat.config.presets import STEP_SETTINGS, stretched
+from clsplat.config.training import TrainConfig
+
+COARSE_STEPS_SHARE = 0.15
+"""Steps of the coarse model's training, as a fraction of the steps of the whole."""
+COARSE_SIZE = 0.5
+"""Size of the photographs from which the coarse model is trained, as a fraction of their size in the whole."""
+FINISH_STEPS_SHARE = 0.05
+"""Steps over all photographs after the merge, as a fraction of the steps of the whole."""
+
+
+def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
+    """Return the settings of the coarse model's training.
+
+    config: settings of the training of the whole.
+    longest: longest side of the photographs at the size of the whole, in pixels.
+    The schedule is shortened, with two exceptions. The time between densifications stays, because a densification after
+    a few steps would rate Gaussians by a few photographs. Opacities are never reset, because the resets would come
+    before all photographs have been seen since the last.
+    """
+    short = stretched(config, coarse_steps(config), [name for name in STEP_SETTINGS if name != "density.every"])
+    density = replace(short.density, opacity_reset_every=0)
+    if density.fills:  # pictures of half the size show a quarter of the pixels
+        density = replace(density, max_gaussians=max(round(COARSE_SIZE**2 * density.max_gaussians), 1))
+    return replace(short, resolution=max(round(COARSE_SIZE * longest), 1), eval_at=(), density=density)
+
+
+def coarse_steps(config: TrainConfig) -> int:
+    """Number of steps of the coarse model's training. config: settings of the training of the whole."""
+    return max(round(COARSE_STEPS_SHARE * config.iterations), 1)
+
+
+def block_steps(config: TrainConfig, photographs: int, of: int) -> int:
+    """Number of steps of a block: the passes that the coarse model's training leaves, through the block's photographs.
+
+    config: settings of the training of the whole.
+    photographs: number of the block's photographs.
+    of: number of the scene's training photographs.
+    """
+    return max(round(photographs * (config.iterations - coarse_steps(config)) / of), 1)
+
+
+def finish_steps(config: TrainConfig) -> int:
+    """Number of steps over all photographs after the merge. config: settings of the training of the whole."""
+    return max(round(FINISH_STEPS_SHARE * config.iterations), 1)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Making of a plan: the ground is divided into cells, whose loads are measured with the coarse model."""
+
+from __future__ import annotations
+
+from math import ceil, inf
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Partition
+from clsplat.blocks.planning.coarse import block_steps, finish_steps
+from clsplat.blocks.planning.measurement import CellLoads, LoadMeasurement
+from clsplat.blocks.planning.split import (
+    MAX_BLOCKS,
+    Leaf,
+    Tree,
+    balanced,
+    cells,
+    cut_again,
+    gridded,
+    parse_blocks,
+    without,
+)
+from clsplat.camera import Camera
+from clsplat.errors import InputError, amount, examples
+from clsplat.files.documents import known_digest
+from clsplat.runs import scene_record
+from clsplat.runs.run import Run, is_run
+from clsplat.scenes.scene import Scene
+
+MIN_CAMERA_PLACES = 2
+"""Least number of different camera positions of a block."""
+MIN_LOAD_DROP = 0.95
+"""Cuts for a limit go on as long as each round multiplies the largest load by at most this factor."""
+
+
+def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division: Partition) -> BlockPlan:
+    """Divide a scene into blocks, and measure their loads.
+
+    coarse: run of the coarse model.
+    source: path of the scene.
+    Raises InputError for limits that no division meets.
+    """
+    config, photographs = measurement.config, [view.name for view in measurement.scene.train_views]
+    loads, joined = divided(measurement, division)
+    blocks = []
+    for index, name in enumerate(loads.names):
+        own = tuple(photographs[photograph] for photograph in np.flatnonzero(loads.belongs[:, index]))
+        steps, gaussians = block_steps(config, len(own), len(photographs)), round(float(loads.around[index]))
+        blocks.append(Block(name, loads.cells[index], loads.widened[index], own, steps, gaussians))
+    record = scene_record.read(coarse)
+    assert record is not None, "the training of the coarse model has written it"
+    return BlockPlan(
+        scene=source.absolute(),
+        settings=config,
+        division=division,
+        up=measurement.ground.up,
+        axes=measurement.ground.axes,
+        margin=MARGIN,
+        share=SHARE,
+        coarse=known_digest(coarse.model_path),
+        scene_digest=scene_record.digest_of(record),
+        finish_steps=finish_steps(config),
+        blocks=tuple(blocks),
+        joined=tuple(joined),
+        photographs=len(photographs),
+        gaussians=len(measurement.model),
+    )
+
+
+def coarse_run(city: Path) -> Run | None:
+    """Return the run of the coarse model in a city's folder; None if it has not begun."""
+    folder = city / COARSE_FOLDER
+    return Run.open(folder) if is_run(folder) else None
+
+
+def coarse_cameras(coarse: Run, scene: Scene) -> list[Camera]:
+    """Return the cameras of a scene's training views at the size of the coarse model's photographs."""
+    record = scene_record.read(coarse)
+    sizes = {} if record is None else {name: view["size"] for name, view in record["views"].items()}
+    return [view.camera.resized(*sizes[view.name]) if view.name in sizes else view.camera for view in scene.train_views]
+
+
+def divided(measurement: LoadMeasurement, division: Partition) -> tuple[CellLoads, list[str]]:
+    """Divide the ground into the cells that `division` asks for, and measure their loads.
+
+    For "auto", there are as few cells as the limits allow. Cells that cannot be trained are joined to their neighbours.
+    Returns the loads, and a line for each cell that was joined. Raises InputError for limits that no division meets.
+    """
+    asked = parse_blocks(division.blocks)
+    if isinstance(asked, tuple):
+        tree = gridded(measurement.places, *asked)
+    elif asked is not None:
+        tree = balanced(measurement.places, asked)
+    else:
+        tree = _within(measurement, division.memory or measurement.device.budget, division.photographs)
+    return _joined(measurement, tree)
+
+
+def _within(measurement: LoadMeasurement, memory: int, most: int | None) -> Tree:
+    """Cut each block that is over a limit in two, until none is.
+
+    memory: largest number of bytes of device memory of a block.
+    most: largest number of photographs of a block; None for no limit.
+    Raises InputError if smaller cells do not help.
+    """
+    places = measurement.places
+    tree, before = balanced(places, min(ceil(len(places) / (most or len(places))), MAX_BLOCKS)), inf
+    while True:
+        loads = measurement.of(tree)
+        taken = [measurement.bytes_needed(gaussians) for gaussians in loads.around]
+        counts = [int(count) for count in loads.belongs.sum(axis=0)]
+        parts = [max(size / memory, count / (most or inf)) for size, count in zip(taken, counts, strict=True)]
+        largest = max(parts)
+        if largest <= 1:
+            return tree
+        over = [name for name, part in zip(loads.names, parts, strict=True) if part > 1]
+        finer = cut_again(tree, over, places)
+        if finer == tree or largest > MIN_LOAD_DROP * before or len(list(cells(finer))) > MAX_BLOCKS:
+            if max(taken) / memory == largest:
+                raise InputError(
+                    f"--block-mem {amount(memory)}: the largest of {len(parts):,} blocks would still take "
+                    f"{amount(max(taken))}, and smaller blocks hardly less; expected at least that, or a smaller "
+                    "--resolution"
+                )
+            raise InputError(
+                f"--block-photographs {most}: the largest of {len(parts):,} blocks would still have {max(counts):,} "
+                "photographs, and smaller blocks hardly fewer, as each photograph shows several; expected at least that"
+            )
+        tree, before = finer, largest
+
+
+def _joined(measurement: LoadMeasurement, tree: Tree) -> tuple[CellLoads, list[str]]:
+    """Measure the cells' loads, and join each cell that cannot be trained to its neighbours.
+
+    Returns the loads of the remaining cells, and a line for each joined cell.
+    """
+    notes: list[str] = []
+    while True:
+        loads = measurement.of(tree)
+        unfit = {name: why for index, name in enumerate(loads.names) if (why := _unfit(measurement, loads, index))}
+        if not unfit or isinstance(tree, Leaf):
+            return loads, notes
+        for name, why in unfit.items():
+            if isinstance(tree, Leaf):
+                break
+            tree, neighbours = without(tree, name)
+            joined = examples([neighbour.replace("_", ",") for neighbour in neighbours])
+            notes.append(f"block {name.replace('_', ',')} has {why}: its cell is joined to block {joined}")
+
+
+def _unfit(measurement: LoadMeasurement, loads: CellLoads, index: int) -> str:
+    """Return in words why a cell cannot be trained; empty if it can."""
+    own = measurement.camera_places[loads.belongs[:, index]]
+    if not loads.inside[index]:
+        return "no points"
+    if not len(own):
+        return "no photographs"
+    return "one camera" if len(np.unique(own, axis=0)) < MIN_CAMERA_PLACES else ""

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records of a block's or a finish's training: begun.json from its first moment on, done.json once it has finished."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE
+from clsplat.errors import InputError
+from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import digest, load_document
+from clsplat.report import PLAN_PICTURE_FILE
+
+BEGUN_FILE, DONE_FILE = "begun.json", "done.json"
+"""Names of the records in a run's folder: of the start of a training, and of its end."""
+MERGED_FILE, JOBS_FOLDER = "merged.ply", "jobs"
+"""Names of the merged model, and of the folder for claims and logs of tasks, in a city's folder."""
+CITY_FILES = frozenset(
+    {PLAN_FILE, PLAN_PICTURE_FILE, COARSE_FOLDER, BLOCKS_FOLDER, MERGED_FILE, JOBS_FOLDER, BEGUN_FILE, DONE_FILE}
+)
+"""Names of files and folders in a city's folder, beside those of the run that is the finish."""
+_EXPECTED_RECORD = "a record that clsplat blocks wrote"
+
+
+@dataclass(frozen=True)
+class DoneRecord:
+    """The end of a training.
+
+    plan: digest of the plan (`BlockPlan.digest`).
+    start: SHA-256 of the model that the training began with.
+    model: SHA-256 of the trained model's file.
+    """
+
+    plan: str
+    start: str
+    model: str
+
+
+def check_begun(run: Path, plan: str, start: str) -> None:
+    """Record that a training begins in the folder `run`, or check that it began like this.
+
+    plan, start: as for `DoneRecord`.
+    Raises InputError if the training in the folder began by another plan, or with another model.
+    """
+    path = run / BEGUN_FILE
+    if not path.exists():
+        run.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, (json.dumps({"clsplat_block": 1, "plan": plan, "start": start}) + "\n").encode())
+        return
+    record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
+    for name, now, what in (("plan", plan, "by another plan"), ("start", start, "with another model")):
+        if record.get(name) != now:
+            raise InputError(
+                f"{run}: its training began {what} ({name} {str(record.get(name))[:12]}, now {now[:12]}); move the "
+                "folder away to train anew"
+            )
+
+
+def keep_done(run: Path, plan: str, start: str) -> None:
+    """Write done.json for the finished training in the folder `run`. plan, start: as for `DoneRecord`."""
+    record = DoneRecord(plan, start, digest(run / "model.ply"))
+    atomic_write(run / DONE_FILE, (json.dumps({"clsplat_block": 1, **asdict(record)}) + "\n").encode())
+
+
+def done_record(run: Path) -> DoneRecord | None:
+    """Return the record of a finished training; None if it has not finished, or its model is missing.
+
+    Raises InputError for a damaged record.
+    """
+    path = run / DONE_FILE
+    if not path.exists() or not (run / "model.ply").exists():
+        return None
+    record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
+    texts = [record.get(name) for name in ("plan", "start", "model")]
+    if not all(isinstance(text, str) for text in texts):
+        raise InputError(f"{path}: is damaged, expected {_EXPECTED_RECORD}; remove it, and train the block again")
+    return DoneRecord(*map(str, texts))
+
+
+def is_done(run: Path, plan: str, start: str | None = None) -> bool:
+    """True if the training in the folder `run` has finished by this plan, and with this start unless it is None.
+
+    plan, start: as for `DoneRecord`.
+    """
+    record = done_record(run)
+    return record is not None and record.plan == plan and start in (None, record.start)

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat blocks finish`: the training of the merged model on all photographs."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from tyro.conf import arg
+
+from clsplat.cli.blocks.city_runs import CityFolder, loader, tell_of_city, trainer
+from clsplat.cli.options import Flag, OptionalInt, Verb
+from clsplat.cli.session import Services
+from clsplat.cli.training_run import TrainingMachine
+
+
+@dataclass(frozen=True)
+class BlocksFinishVerb(Verb):
+    """Train the merged model on all photographs, evaluate it, and write the report. CITY is a run then.
+
+    The same command goes on after an interruption.
+    """
+
+    city: CityFolder
+    """Folder with the merged model (clsplat blocks merge)."""
+    finish: OptionalInt = None
+    """Number of steps. If not given: those of the run that goes on, else those of the plan."""
+    device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
+    json: Flag = False
+    """Print the evaluation as JSON on standard output."""
+
+
+def run(verb: BlocksFinishVerb, services: Services) -> int:
+    """Train the merged model, unless that has been done."""
+    from clsplat.blocks.block_training import finish
+
+    verb.device.check()
+    train = trainer(services, verb.device)
+    if not finish(verb.city, verb.finish, loader(services), train, verb.device.count):
+        print(f"{verb.city}: has been finished before", file=sys.stderr)
+    tell_of_city(verb.city, as_json=verb.json)
+    return 0

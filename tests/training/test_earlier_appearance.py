@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A training that begins with the appearance of an earlier run, and keeps it or trains it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import refusal
+from compare import assert_same_bits
+from tiny import short
+
+from clsplat.api import train
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
+from clsplat.training.start import Start
+from clsplat.training.trainer import Trainer
+
+KINDS = ("exposure", "ppisp", "grid")
+CONFIG = short(iterations=12, report=False, test_every=0, warmup=(), density={"every": 0})
+
+
+def config_of(kind: str, **changes: object) -> TrainConfig:
+    return replace(CONFIG, appearance=kind, **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def earlier(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, scene: Scene, default_device: Device
+) -> Run:
+    """A run that has learnt one of the appearances of all photographs."""
+    config = config_of(request.param)
+    run = Run.create(tmp_path_factory.mktemp("earlier") / "run", config)
+    run.model = train(scene, config, run=run, device=default_device)
+    return run
+
+
+def some_of(scene: Scene) -> Scene:
+    """Every second training view, so that places in arrays differ from the earlier run's."""
+    return replace(scene, views=scene.train_views[1::2])
+
+
+def photographs(record: dict[str, object]) -> dict[str, object]:
+    return json.loads(json.dumps(record["photographs"]))
+
+
+def values(trainer: Trainer) -> dict[str, np.ndarray]:
+    """What the trainer's appearance has of each photograph."""
+    record = photographs(trainer.appearance.record() or {})
+    grids = trainer.appearance.tables().get("grids")
+    if grids is not None:
+        return {name: grids[row["grid"]] for name, row in record.items()}
+    return {name: np.concatenate([row[part] for part in sorted(row)]) for name, row in record.items()}
+
+
+def of_run(run: Run) -> dict[str, np.ndarray]:
+    record = photographs(json.loads(run.appearance_path.read_text()))
+    if run.config.appearance == "grid":
+        grids = np.load(run.appearance_path.with_suffix(".npz"))["grids"]
+        return {name: grids[row["grid"]] for name, row in record.items()}
+    return {name: np.concatenate([row[part] for part in sorted(row)]) for name, row in record.items()}
+
+
+def test_a_fixed_appearance_stays_and_the_model_learns(earlier: Run, scene: Scene, default_device: Device) -> None:
+    some, config = some_of(scene), earlier.config
+    trainer = Trainer(some, config, default_device, Start(earlier.model, appearance_of=earlier.path))
+    before = trainer.gaussians()
+    for _ in range(6):
+        trainer.train_step()
+    now, known = values(trainer), of_run(earlier)
+    assert set(now) == {view.name for view in some.train_views}
+    for name, value in now.items():
+        assert_same_bits(value, known[name], name)
+    assert (before.means != trainer.gaussians().means).any()
+
+
+def test_the_loss_is_that_of_the_earlier_appearance(earlier: Run, scene: Scene, default_device: Device) -> None:
+    """The first step's loss is the earlier training's with the same model and view, not that of plain photographs."""
+    one = replace(scene, views=scene.train_views[2:3])
+    config = earlier.config
+    start = Start(earlier.model, appearance_of=earlier.path)
+    kept = Trainer(one, config, default_device, start).train_step(reads_loss=True).read()[0]
+    plain = Trainer(one, replace(config, appearance="none"), default_device, earlier.model)
+    plain_loss = plain.train_step(reads_loss=True).read()[0]
+    trained = Trainer(one, config, default_device, replace(start, trains_appearance=True))
+    assert kept == trained.train_step(reads_loss=True).read()[0]
+    assert kept != plain_loss
+
+
+def test_an_appearance_goes_on_where_it_was(earlier: Run, scene: Scene, default_device: Device) -> None:
+    start = Start(earlier.model, appearance_of=earlier.path, trains_appearance=True)
+    trainer = Trainer(scene, earlier.config, default_device, start)
+    for name, value in values(trainer).items():
+        assert_same_bits(value, of_run(earlier)[name], name)
+    for _ in range(6):
+        trainer.train_step()
+    assert any((value != of_run(earlier)[name]).any() for name, value in values(trainer).items())
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_resumed_training_has_the_same_bytes(
+    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path, batch: int
+) -> None:
+    some, config = some_of(scene), replace(earlier.config, batch=batch)
+    start = Start(earlier.model, appearance_of=earlier.path)
+    whole = train(some, config, device=default_device, start=start)
+    run = Run.create(tmp_path / "run", replace(config, iterations=4))
+    train(some, replace(config, iterations=4), run=run, device=default_device, start=start)
+    resumed = train(some, config, run=Run.open(run.path), resume=True, device=default_device, start=start)
+    for name, array in whole.arrays().items():
+        assert_same_bits(resumed.arrays()[name], array, name)
+    for name, value in of_run(Run.open(run.path)).items():
+        assert_same_bits(value, of_run(earlier)[name], name)
+
+
+def test_what_is_missing_is_named(earlier: Run, scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    def begun(folder: Path, kind: str = earlier.config.appearance) -> str:
+        start = Start(earlier.model, appearance_of=folder)
+        return refusal(lambda: Trainer(scene, config_of(kind), default_device, start))
+
+    assert "appearance.json: no such file" in begun(tmp_path)
+    other = KINDS[KINDS.index(earlier.config.appearance) - 1]
+    assert f"is of --appearance {earlier.config.appearance}, expected --appearance {other}" in begun(
+        earlier.path, other
+    )
+    record = json.loads(earlier.appearance_path.read_text())
+    name = scene.train_views[3].name
+    del record["photographs"][name]
+    (tmp_path / "appearance.json").write_text(json.dumps(record))
+    assert f"lacks 1 of {len(scene.train_views)} photographs ({name})" in begun(tmp_path)
+    record["photographs"][name] = {"log2_gains": [0, "a", 1], "grid": -1}
+    (tmp_path / "appearance.json").write_text(json.dumps(record))
+    assert "expected a file that clsplat train --appearance writes" in begun(tmp_path)

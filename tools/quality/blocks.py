@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The experiment of blocks: a scene whole and in blocks, its borders, their colours, and floaters."""
+
+from __future__ import annotations
+
+import shutil
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+from quality.trainings import Rows, call, trained, words_of
+
+from clsplat.arrays import Float32, Float64
+from clsplat.blocks import block_training
+from clsplat.blocks.merging import region_of
+from clsplat.blocks.plan import BlockPlan, read_plan
+from clsplat.camera import Camera
+from clsplat.device.selection import open_device
+from clsplat.gaussians import Gaussians
+from clsplat.images.writing import write_image
+from clsplat.models.edit import take
+from clsplat.optimisation.trained_region import TrainedRegion
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene, View
+from clsplat.training.start import Start
+
+BAND_METRES = 3.0
+"""Width, on each side of a border, of the band in which PSNR and colours are measured, in world units of the town."""
+EXTRA_STEPS = 1.05
+"""Steps of the whole's training, as a multiple of --iterations, because the finish adds about as many to the blocks."""
+WORST_PSNR = 120.0
+
+
+@dataclass
+class Border:
+    """Squared errors and colours of pixels in the band along the borders, and elsewhere."""
+
+    plan: BlockPlan
+    band: float
+
+    def distances(self, places: Float64) -> Float64:
+        """Distance (n,) of points on the ground (n, 2) from the nearest border."""
+        found = np.full(len(places), np.inf)
+        for block in self.plan.blocks:
+            low, high = np.array(block.cell.low), np.array(block.cell.high)
+            inside = ((places >= low) & (places < high)).all(axis=1)
+            edges = np.concatenate([places[inside] - low, high - places[inside]], axis=1)
+            found[inside] = edges.min(axis=1)
+        return found
+
+    def block_of(self, places: Float64) -> NDArray[np.int64]:
+        """Index (n,) of the block in whose cell each point (n, 2) lies."""
+        found = np.full(len(places), -1)
+        for index, block in enumerate(self.plan.blocks):
+            found[((places >= block.cell.low) & (places < block.cell.high)).all(axis=1)] = index
+        return found
+
+
+def unprojected(camera: Camera, depth: Float32) -> Float64:
+    """World positions (H, W, 3) of a pinhole camera's pixels with depths (H, W)."""
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=2)
+    local = rays * depth[:, :, None] - camera.translation
+    return np.asarray(local @ camera.rotation)
+
+
+@dataclass
+class Ground:
+    """Places of the pixels of held-out views, by the depths that a model has.
+
+    distances: for each view, distances (H, W) from the nearest border; infinite where the model is transparent.
+    owners: for each view, the index of the block (H, W); -1 there.
+    """
+
+    distances: list[Float64]
+    owners: list[NDArray[np.int64]]
+
+
+def ground_of(renderer: Renderer, model: Gaussians, views: Sequence[View], border: Border) -> Ground:
+    """Measure where the pixels of views lie on the ground. The depth is the median of the model's along the ray."""
+    ground, axes = Ground([], []), np.array(border.plan.axes)
+    for view in views:
+        result, channels = renderer.render_channels(model, view.camera)
+        there = (result.alpha > 0.5) & np.isfinite(channels["median"])
+        places = unprojected(view.camera, np.where(there, channels["median"], 1.0)) @ axes.T
+        flat = places.reshape(-1, 2)
+        ground.distances.append(np.where(there, border.distances(flat).reshape(there.shape), np.inf))
+        ground.owners.append(np.where(there, border.block_of(flat).reshape(there.shape), -1))
+    return ground
+
+
+def psnrs(renders: Sequence[Float32], photographs: Sequence[Float32], ground: Ground, band: float) -> list[float]:
+    """PSNR in dB, by the mean squared error, of all pixels, of those in the band, and of those elsewhere."""
+    sums = np.zeros((3, 2))
+    for image, photograph, distance in zip(renders, photographs, ground.distances, strict=True):
+        errors = np.square(np.clip(image, 0, 1).astype(np.float64) - photograph).mean(axis=2)
+        known = np.isfinite(distance)
+        for index, mask in enumerate((np.ones_like(known), known & (distance <= band), known & (distance > band))):
+            sums[index] += errors[mask].sum(), mask.sum()
+    return [float(-10 * np.log10(total / max(count, 1))) if total else WORST_PSNR for total, count in sums]
+
+
+def colour_steps(
+    renders: Sequence[Float32], clean: Sequence[Float32], ground: Ground, band: float
+) -> tuple[float, float]:
+    """Mean and largest step of colour across the borders, in levels of 1/255.
+
+    clean: the photographs without changes of exposure. A gain for each channel, the same for all pixels, is taken out.
+    A step is the difference of the mean error between the band's pixels of two blocks, and the mean is over channels.
+    """
+    pixels = [
+        (image[m], photo[m], owner[m])
+        for image, photo, distance, owner in zip(renders, clean, ground.distances, ground.owners, strict=True)
+        for m in [distance <= band]
+    ]
+    image, photo, owner = (np.concatenate(parts) for parts in zip(*pixels, strict=True))
+    gain = (image * photo).sum(axis=0) / np.square(image).sum(axis=0)
+    errors = image * gain - photo
+    means = {block: errors[owner == block].mean(axis=0) for block in np.unique(owner) if (owner == block).sum() > 100}
+    steps = [255 * np.abs(a - b).mean() for i, a in means.items() for j, b in means.items() if i < j]
+    return (float(np.mean(steps)), float(np.max(steps))) if steps else (0.0, 0.0)
+
+
+@contextmanager
+def own_appearance() -> Iterator[None]:
+    """Context in which blocks learn appearances of their own, in place of the coarse model's."""
+    with patch.object(block_training, "_with_appearance", lambda _coarse: None):
+        yield
+
+
+@contextmanager
+def no_surroundings() -> Iterator[None]:
+    """Context in which blocks begin with the Gaussians of their widened cell alone, and train them everywhere."""
+
+    def start(model: Gaussians, region: TrainedRegion | None, *rest: object, **named: object) -> Start:
+        if region is None:
+            return Start(model, region, *rest, **named)  # type: ignore[arg-type]
+        inside = take(model, region.contains(model.means, model.origin))
+        return Start(inside, None, *rest, **named)  # type: ignore[arg-type]
+
+    with patch.object(block_training, "Start", start):
+        yield
+
+
+def town_of(given: Namespace, exposure: float) -> Path:
+    """Write the town, or take the one that is there."""
+    folder: Path = given.folder / f"town-{exposure:g}"
+    if not folder.exists():
+        words = ["--town", given.town, "--town-photos", str(given.town_photos), "--town-size", given.town_size]
+        call(["demo", *words, "--town-exposure", str(exposure), "-o", str(folder)])
+    return folder
+
+
+def city_of(given: Namespace, town: Path, name: str, settings: str, planned: Path | None = None) -> Path:
+    """Train a town in blocks, or go on with it. planned: another city, whose coarse model and plan are taken."""
+    city: Path = given.folder / "cities" / name
+    if planned is not None and not city.exists():
+        shutil.copytree(planned / "coarse", city / "coarse")
+        shutil.copy(planned / "plan.json", city / "plan.json")
+    if planned is None:
+        usual = {"iterations": given.iterations, "seed": given.seed, "resolution": given.resolution}
+        call(
+            ["train", str(town), "-o", str(city), "--no-report", "--blocks", given.blocks, *words_of(settings, **usual)]
+        )
+        return city
+    for block in read_plan(city).blocks:
+        call(["blocks", "train", str(city), "--block", block.name.replace("_", ",")])
+    call(["blocks", "merge", str(city)])
+    call(["blocks", "finish", str(city)])
+    return city
+
+
+def models_of(city: Path) -> dict[str, Gaussians]:
+    """Models of a city by what they are called in the table."""
+    return {
+        "merged": Gaussians.load(city / "merged.ply"),
+        "finished": Gaussians.load(city / "model.ply"),
+    }
+
+
+def blocks(given: Namespace) -> Rows:
+    """A town whole and in blocks: held-out PSNR, in a band along the borders and elsewhere; colours across the borders
+    with and without the coarse model's appearance; PSNR with and without frozen surroundings.
+
+    The whole has as many steps as the blocks with their finish, and at most as many Gaussians.
+    """
+    renderer = Renderer(open_device())
+    town = town_of(given, 0.0)
+    settings = f"schedule=short,sky={given.sky},{given.settings}".rstrip(",")
+    growth = f"density.growth=budget,density.max-gaussians={given.gaussians}"
+    city = city_of(given, town, "frozen", f"{settings},{growth}")
+    plan = read_plan(city)
+    border, scene = Border(plan, BAND_METRES), load_scene(town, resolution=given.resolution)
+    models = models_of(city)
+    count = f"density.growth=budget,density.max-gaussians={len(models['finished'])}"
+    done = trained(
+        given, "whole", town, settings=f"{settings},{count}", iterations=round(EXTRA_STEPS * given.iterations)
+    )
+    of_blocks = sum(len(block.photographs) for block in plan.blocks)
+    yield f"photographs of all blocks / of the scene: {of_blocks / len(scene.train_views):.2f}"
+    yield "model", "Gaussians", "PSNR, dB", "band", "elsewhere", "band less elsewhere"
+    everything = {"whole": done.model, **models}
+    ground = ground_of(renderer, everything["whole"], scene.test_views, border)
+    with no_surroundings():
+        alone = city_of(given, town, "alone", settings, planned=city)
+    everything |= {f"{name}, without surroundings": model for name, model in models_of(alone).items()}
+    photographs = [view.load()[:, :, :3] for view in scene.test_views]
+    pictures: dict[str, list[Float32]] = {}
+    for name, model in everything.items():
+        pictures[name] = [renderer.render(model, view.camera).image for view in scene.test_views]
+        values = psnrs(pictures[name], photographs, ground, BAND_METRES)
+        yield name, f"{len(model):,}", *(f"{value:.2f}" for value in values), f"{values[1] - values[2]:.2f}"
+    save_pictures(given.folder / "pictures", scene, ground, photographs, pictures)
+    yield from floaters(given, renderer, scene, city, alone)
+    if given.exposure:
+        yield from exposures(given, renderer, scene, f"{settings},{growth}")
+    return 0
+
+
+def save_pictures(
+    folder: Path, scene: Scene, ground: Ground, photographs: list[Float32], pictures: dict[str, list[Float32]]
+) -> None:
+    """Write strips of the held-out views with the most pixels in the band: photograph, then each model's render."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shares = [float((distance <= BAND_METRES).mean()) for distance in ground.distances]
+    for place in np.argsort(shares)[::-1][:3]:
+        rows = [photographs[place], *(images[place] for images in pictures.values())]
+        name = scene.test_views[place].name.replace("/", "-").rpartition(".")[0]
+        write_image(folder / f"{name}.png", np.clip(np.concatenate(rows, axis=1), 0, 1).astype(np.float32))
+
+
+def floaters(given: Namespace, renderer: Renderer, scene: Scene, city: Path, alone: Path) -> Rows:
+    """Gaussians of a block that stand for what lies outside it, and pictures of the block from outside."""
+    yield "block", "surroundings", "Gaussians in the widened cell", "opaque volume, m3"
+    plan = read_plan(city)
+    camera = from_outside(scene, plan)
+    for name, folder in (("frozen", city), ("without", alone)):
+        block = plan.blocks[0]
+        model = Gaussians.load(folder / "blocks" / block.name / "model.ply")
+        inside = take(model, region_of(plan, block.widened).contains(model.means, model.origin))
+        volume = np.exp(inside.log_scales.astype(np.float64).sum(axis=1)) / (1 + np.exp(-inside.opacity_logits))
+        yield block.name, name, f"{len(inside):,}", f"{volume.sum():.1f}"
+        image = renderer.render(inside, camera).image
+        write_image(given.folder / "pictures" / f"outside-{name}.png", np.clip(image, 0, 1))
+    return 0
+
+
+def from_outside(scene: Scene, plan: BlockPlan) -> Camera:
+    """A camera that looks at the first block from outside and above."""
+    axes, up = np.array(plan.axes), np.array(plan.up)
+    points = scene.points @ axes.T
+    cell = plan.blocks[0].cell
+    low, high = np.maximum(cell.low, points.min(axis=0)), np.minimum(cell.high, points.max(axis=0))
+    middle = (low + high) / 2 @ axes + up * np.median(scene.points @ up)
+    size = float(np.linalg.norm(high - low))
+    position = middle + up * size * 0.9 - (axes[0] + axes[1]) * size * 0.8
+    forward = (middle - position) / np.linalg.norm(middle - position)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(480, 320, 400.0, 400.0, 240.0, 160.0, rotation, -rotation @ position)
+
+
+def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str) -> Rows:
+    """Steps of colour across the borders of a town whose exposure drifts, before and after the finish."""
+    town = town_of(given, given.exposure)
+    settings = f"{settings},appearance=exposure"
+    city = city_of(given, town, "exposure", settings)
+    with own_appearance():
+        other = city_of(given, town, "exposure own", settings, planned=city)
+    border = Border(read_plan(city), BAND_METRES)
+    clean = [view.load()[:, :, :3] for view in scene.views]
+    yield "appearance of blocks", "model", "mean step of colour, levels", "largest"
+    rows: list[tuple[str, Callable[[], dict[str, Gaussians]]]] = [
+        ("of the coarse model", partial(models_of, city)),
+        ("their own", partial(models_of, other)),
+    ]
+    ground = ground_of(renderer, models_of(city)["finished"], scene.views, border)
+    for kind, models in rows:
+        for name, model in models().items():
+            images = [renderer.render(model, view.camera).image for view in scene.views]
+            mean, largest = colour_steps(images, clean, ground, BAND_METRES)
+            yield kind, name, f"{mean:.2f}", f"{largest:.2f}"
+            place = int(np.argmax([float((distance <= BAND_METRES).mean()) for distance in ground.distances]))
+            file = f"{scene.views[place].name.replace('/', '-')}-{kind.replace(' ', '-')}-{name}.png"
+            write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
+    return 0
