@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.blocks.ground import axes_of_ground, ground_of, on_ground, parse_up
+from clsplat.blocks.planning.ground import axes_of_ground, ground_of, on_ground, parse_up
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.scenes.dataset import SceneFrame

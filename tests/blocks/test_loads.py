@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clsplat.blocks.loads import belonging, places_seen
+from clsplat.blocks.planning.loads import belonging, places_seen
 
 
 def test_a_photograph_shows_the_median_of_its_pixels() -> None:

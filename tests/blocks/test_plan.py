@@ -15,7 +15,7 @@ import pytest
 from small_city import WHOLE
 
 from clsplat.blocks import plan as plans
-from clsplat.blocks.plan import PLAN_FILE, Block, BlockPlan, Division, Rectangle, read_plan, write_plan
+from clsplat.blocks.plan import PLAN_FILE, Block, BlockPlan, Partition, Rectangle, read_plan, write_plan
 from clsplat.blocks.plan_check import check_plan, kept_plan
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
@@ -25,7 +25,7 @@ WEST, EAST = Rectangle((-inf, -inf), (0.1 + 0.2, inf)), Rectangle((0.1 + 0.2, -i
 PLAN = BlockPlan(
     scene=Path("/scenes/town"),
     settings=TrainConfig(seed=3, warmup=(5, 9)),
-    division=Division("auto", 1 << 33, 500),
+    division=Partition("auto", 1 << 33, 500),
     up=(0.0, -1.0, 0.0),
     axes=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     margin=0.2,
@@ -143,8 +143,8 @@ def test_another_coarse_model_is_refused(city: Path, small_scene: Path) -> None:
 def test_a_plan_with_other_options_is_made_anew_until_blocks_are_trained(city: Path, small_scene: Path) -> None:
     scene, plan = load_scene_of(WHOLE, small_scene), read_plan(city)
     assert kept_plan(city, scene, WHOLE, plan.division, plan.up) == plan
-    assert kept_plan(city, scene, WHOLE, Division("3"), plan.up) is None
+    assert kept_plan(city, scene, WHOLE, Partition("3"), plan.up) is None
     (city / "blocks" / "0_0").mkdir(parents=True)
     with pytest.raises(InputError, match=r"--blocks is 2 in the plan and 3 now.*expected the same"):
-        kept_plan(city, scene, WHOLE, Division("3"), plan.up)
+        kept_plan(city, scene, WHOLE, Partition("3"), plan.up)
     assert kept_plan(city, scene, WHOLE, plan.division, plan.up) == plan

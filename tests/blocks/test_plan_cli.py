@@ -13,8 +13,8 @@ import pytest
 from calls import Capture
 from test_plan import PLAN
 
-from clsplat.blocks.picture import plan_svg, plan_table, plan_total
 from clsplat.blocks.plan import read_plan
+from clsplat.blocks.planning.picture import plan_svg, plan_table, plan_total
 from clsplat.cli.main import main
 from clsplat.cli.session import Services
 from clsplat.runs.run import Run

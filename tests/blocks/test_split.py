@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Division of the ground into cells: half-open, without gaps or overlaps, with equal numbers of places."""
+"""Partition of the ground into cells: half-open, without gaps or overlaps, with equal numbers of places."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clsplat.blocks.loads import CellBins
 from clsplat.blocks.plan import Rectangle
-from clsplat.blocks.split import (
+from clsplat.blocks.planning.loads import CellBins
+from clsplat.blocks.planning.split import (
     MAX_BLOCKS,
     PLANE,
-    Cut,
+    GroundCut,
     Leaf,
     Tree,
     balanced,
@@ -55,7 +55,7 @@ def test_each_place_is_in_exactly_one_cell_and_cells_have_equal_numbers(count: i
         assert sum(counts(tree, points)) == len(points)
 
 
-def cuts(tree: Tree) -> list[Cut]:
+def cuts(tree: Tree) -> list[GroundCut]:
     return [] if isinstance(tree, Leaf) else [tree, *cuts(tree.below), *cuts(tree.above)]
 
 
@@ -81,9 +81,9 @@ def test_a_grid_has_columns_of_rows() -> None:
 def test_a_cut_is_across_the_longer_side() -> None:
     wide = np.random.default_rng(3).uniform(0, 1, (100, 2)) * (10, 1)
     tree = balanced(wide, 2)
-    assert isinstance(tree, Cut) and tree.axis == 0
+    assert isinstance(tree, GroundCut) and tree.axis == 0
     tree = balanced(wide[:, ::-1].copy(), 2)
-    assert isinstance(tree, Cut) and tree.axis == 1
+    assert isinstance(tree, GroundCut) and tree.axis == 1
 
 
 def test_equal_places_are_not_cut() -> None:

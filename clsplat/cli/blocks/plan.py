@@ -24,7 +24,7 @@ from clsplat.errors import InputError, warn
 from clsplat.progress import StageProgress, aligned
 
 if TYPE_CHECKING:
-    from clsplat.blocks.plan import BlockPlan, Division, Point
+    from clsplat.blocks.plan import BlockPlan, Partition, Point
     from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
 
@@ -90,7 +90,7 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     """Make the plan. Errors in the command line are reported before anything is written."""
     from clsplat.blocks.plan import PLAN_FILE
     from clsplat.blocks.plan_check import check_new_plan, kept_plan
-    from clsplat.blocks.planning import coarse_run
+    from clsplat.blocks.planning.new_plan import coarse_run
 
     division, up = _checked(verb)
     city = verb.output
@@ -111,11 +111,11 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     return 0
 
 
-def _checked(verb: BlocksPlanVerb) -> tuple[Division, Point | None]:
+def _checked(verb: BlocksPlanVerb) -> tuple[Partition, Point | None]:
     """Check the flags. Returns the options of the division, and the up direction if it is given."""
-    from clsplat.blocks.ground import parse_up
-    from clsplat.blocks.plan import Division
-    from clsplat.blocks.split import parse_blocks
+    from clsplat.blocks.plan import Partition
+    from clsplat.blocks.planning.ground import parse_up
+    from clsplat.blocks.planning.split import parse_blocks
 
     parse_blocks(verb.blocks)
     limits = verb.limits
@@ -128,7 +128,7 @@ def _checked(verb: BlocksPlanVerb) -> tuple[Division, Point | None]:
     verb.config.check()
     memory = parse_bytes(limits.block_mem, "--block-mem")
     up = parse_up(limits.up) if limits.up is not None else None
-    return Division(verb.blocks, memory, limits.block_photographs), up
+    return Partition(verb.blocks, memory, limits.block_photographs), up
 
 
 def _scene(verb: BlocksPlanVerb, services: Services, coarse: Run | None) -> tuple[Scene, TrainConfig]:
@@ -153,9 +153,9 @@ def _trained(verb: BlocksPlanVerb, services: Services, coarse: Run | None, scene
     coarse: the run if it has begun before.
     scene, config: the scene at the size of the whole, and the settings of the whole.
     """
-    from clsplat.blocks.coarse import coarse_settings
     from clsplat.blocks.plan import COARSE_FOLDER
     from clsplat.blocks.plan_check import check_coarse
+    from clsplat.blocks.planning.coarse import coarse_settings
     from clsplat.cli import train
     from clsplat.runs.run import Run
 
@@ -179,19 +179,20 @@ def _made(
     coarse: Run,
     scene: Scene,
     config: TrainConfig,
-    options: tuple[Division, Point | None],
+    options: tuple[Partition, Point | None],
 ) -> BlockPlan:
     """Divide the scene with the coarse model, and write the plan and its picture.
 
     options: options of the division, and the up direction if it is given.
     """
-    from clsplat.blocks.ground import ground_of
-    from clsplat.blocks.measurement import LoadMeasurement
-    from clsplat.blocks.picture import plan_svg
-    from clsplat.blocks.plan import PLAN_PICTURE_FILE, write_plan
-    from clsplat.blocks.planning import coarse_cameras, made_plan
+    from clsplat.blocks.plan import write_plan
+    from clsplat.blocks.planning.ground import ground_of
+    from clsplat.blocks.planning.measurement import LoadMeasurement
+    from clsplat.blocks.planning.new_plan import coarse_cameras, made_plan
+    from clsplat.blocks.planning.picture import plan_svg
     from clsplat.files.atomic import atomic_write
     from clsplat.gaussians import Gaussians
+    from clsplat.report import PLAN_PICTURE_FILE
     from clsplat.selftest.result import stages_of_training
 
     division, up = options
@@ -210,8 +211,8 @@ def _made(
 
 def _tell(city: Path, plan: BlockPlan) -> None:
     """Print the table of blocks, and where the plan is."""
-    from clsplat.blocks.picture import plan_table, plan_total
     from clsplat.blocks.plan import PLAN_FILE
+    from clsplat.blocks.planning.picture import plan_table, plan_total
 
     print("\n".join(aligned(plan_table(plan))))
     print(plan_total(plan))

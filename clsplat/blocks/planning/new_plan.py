@@ -8,10 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.coarse import block_steps, finish_steps
-from clsplat.blocks.measurement import CellLoads, LoadMeasurement
-from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Division
-from clsplat.blocks.split import MAX_BLOCKS, Leaf, Tree, balanced, cells, cut_again, gridded, parse_blocks, without
+from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Partition
+from clsplat.blocks.planning.coarse import block_steps, finish_steps
+from clsplat.blocks.planning.measurement import CellLoads, LoadMeasurement
+from clsplat.blocks.planning.split import (
+    MAX_BLOCKS,
+    Leaf,
+    Tree,
+    balanced,
+    cells,
+    cut_again,
+    gridded,
+    parse_blocks,
+    without,
+)
 from clsplat.camera import Camera
 from clsplat.errors import InputError, amount, examples
 from clsplat.files.documents import known_digest
@@ -25,7 +35,7 @@ MIN_LOAD_DROP = 0.95
 """Cuts for a limit go on as long as each round multiplies the largest load by at most this factor."""
 
 
-def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division: Division) -> BlockPlan:
+def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division: Partition) -> BlockPlan:
     """Divide a scene into blocks, and measure their loads.
 
     coarse: run of the coarse model.
@@ -72,7 +82,7 @@ def coarse_cameras(coarse: Run, scene: Scene) -> list[Camera]:
     return [view.camera.resized(*sizes[view.name]) if view.name in sizes else view.camera for view in scene.train_views]
 
 
-def divided(measurement: LoadMeasurement, division: Division) -> tuple[CellLoads, list[str]]:
+def divided(measurement: LoadMeasurement, division: Partition) -> tuple[CellLoads, list[str]]:
     """Divide the ground into the cells that `division` asks for, and measure their loads.
 
     For "auto", there are as few cells as the limits allow. Cells that cannot be trained are joined to their neighbours.
