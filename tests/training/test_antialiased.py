@@ -14,7 +14,7 @@ from clsplat.device.context import Device
 from clsplat.reference.sampling import sampling_limits
 from clsplat.scenes.scene import Scene
 from clsplat.training import mip_filter
-from clsplat.training.mip_filter import MipFilter
+from clsplat.training.step.mip_filter import MipFilter
 from clsplat.training.trainer import Trainer
 
 SMOOTH = replace(CONFIG, antialiased=True)
