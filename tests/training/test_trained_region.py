@@ -30,7 +30,7 @@ from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.stages import region
+from clsplat.stages import region as region_stage
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.repro_bundle import read_bundle, replay, write_bundle
 from clsplat.training.stability.health import Incident
@@ -127,11 +127,11 @@ def test_far_from_the_origin_of_the_world() -> None:
 def test_rows_inside_are_found_piece_by_piece(
     default_device: Device, monkeypatch: pytest.MonkeyPatch, rows: int
 ) -> None:
-    monkeypatch.setattr(region, "TESTED_ROWS", rows)
+    monkeypatch.setattr(region_stage, "TESTED_ROWS", rows)
     means = start_model().means
-    found = region.rows_inside(upload(default_device, means), REGION)
+    found = region_stage.rows_inside(upload(default_device, means), REGION)
     assert found.tolist() == np.flatnonzero(REGION.contains(means)).tolist()
-    assert len(region.rows_inside(upload(default_device, means[:0]), REGION)) == 0
+    assert len(region_stage.rows_inside(upload(default_device, means[:0]), REGION)) == 0
 
 
 @pytest.mark.parametrize(
