@@ -162,4 +162,5 @@ def scene_differences(
     now = scene_record.record_of(replace(scene, views=views), earlier["resolution"])
     # `origin` comes from all cameras, so it is not known from a part of the views
     earlier = {**earlier, "views": {name: view for name, view in earlier["views"].items() if name in names}}
-    return scene_record.differences(earlier, now, moved=scene.world_from_files is not None)
+    # photographs colour points that have no colour, such as the sky's: the coarse model's are of another size
+    return scene_record.differences(earlier, now, moved=True)

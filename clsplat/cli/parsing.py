@@ -32,6 +32,9 @@ VERBS = {
     "sfm": "Turn photos and videos into a scene: COLMAP's cameras and points, and the undistorted images.",
     "train": "Train a scene.",
     "blocks plan": "Divide a large scene into blocks, which can be trained on many machines.",
+    "blocks train": "Train one block of a plan, as a run in CITY/blocks.",
+    "blocks merge": "Merge the models of all blocks into CITY/merged.ply.",
+    "blocks finish": "Train the merged model on all photographs, evaluate it, and write the report.",
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
@@ -53,7 +56,10 @@ VERBS = {
 Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `run`. A module is imported only when its
 verb is called.
 """
-_VERB_MODULES = {"render": "render.verb", "blocks plan": "blocks.plan"}
+_VERB_MODULES = {
+    "render": "render.verb",
+    **{f"blocks {name}": f"blocks.{name}" for name in ("plan", "train", "merge", "finish")},
+}
 """Module, relative to `clsplat.cli`, of each verb that has a folder of its own."""
 
 
