@@ -18,8 +18,8 @@ from clsplat.files.documents import load_document
 from clsplat.runs.settings import config_of, table_of
 from clsplat.version import package_version
 
-PLAN_FILE, PLAN_PICTURE_FILE = "plan.json", "plan.svg"
-"""Names of the plan's files in a city's folder."""
+PLAN_FILE = "plan.json"
+"""Name of the plan's file in a city's folder. Its picture is PLAN_PICTURE_FILE (`clsplat.report`)."""
 COARSE_FOLDER, BLOCKS_FOLDER = "coarse", "blocks"
 """Names of the folders, in a city's folder, of the coarse model's run and of the blocks' runs."""
 MAX_PLAN_BYTES = 256 << 20
@@ -69,7 +69,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Division:
+class Partition:
     """The options by which a scene is divided into blocks.
 
     blocks: "auto", a number of blocks such as "4", or numbers of blocks along both axes such as "2x3".
@@ -104,7 +104,7 @@ class BlockPlan:
 
     scene: Path
     settings: TrainConfig
-    division: Division
+    division: Partition
     up: Point
     axes: Axes
     margin: float
@@ -196,7 +196,7 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
     plan = BlockPlan(
         scene=Path(_text(document["scene"])),
         settings=config_of(document["train"], path),
-        division=Division(
+        division=Partition(
             _text(division["blocks"]), _count_or_none(division["memory"]), _count_or_none(division["photographs"])
         ),
         up=_point(document["up"]),

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsplat.blocks.ground import ground_of
-from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE, BlockPlan, Division, Point, read_plan
+from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE, BlockPlan, Partition, Point, read_plan
+from clsplat.blocks.planning.ground import ground_of
 from clsplat.blocks.progress_records import CITY_FILES
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, examples
@@ -63,7 +63,7 @@ def check_new_plan(city: Path) -> None:
     check_output(city, resume=is_run(city), overwrite=False, beside=CITY_FILES)
 
 
-def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Division, up: Point | None) -> BlockPlan | None:
+def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Partition, up: Point | None) -> BlockPlan | None:
     """Return the plan in a city's folder if it was made for this scene with these options.
 
     division, up: the options of the division; None for an up direction that is estimated.

@@ -7,10 +7,11 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE, PLAN_PICTURE_FILE
+from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE
 from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import digest, load_document
+from clsplat.report import PLAN_PICTURE_FILE
 
 BEGUN_FILE, DONE_FILE = "begun.json", "done.json"
 """Names of the records in a run's folder: of the start of a training, and of its end."""

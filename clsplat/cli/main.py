@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
-from clsplat.cli.parsing import as_json, parse, report, tell
+from clsplat.cli.parsing import as_json, parse, report, run_function, tell
 from clsplat.cli.session import Services
 from clsplat.errors import ClsplatError, InputError, switched_on, system_trouble
 from clsplat.process import reader_has_gone, status_of, terminable
@@ -57,7 +57,7 @@ def _run(arguments: list[str], services: Services) -> int:
                 return 0
             with terminable():
                 verb = parse(arguments)
-                return int(cast("Any", sys.modules[type(verb).__module__]).run(verb, services))
+                return int(run_function(verb)(verb, services))
         except SystemExit as error:  # `parse` raises this after the help or after reporting a wrong call
             return error.code if isinstance(error.code, int) else 1
         except KeyboardInterrupt as error:

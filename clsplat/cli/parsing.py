@@ -9,11 +9,11 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import make_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import tyro
 from tyro.conf import subcommand
@@ -21,6 +21,9 @@ from tyro.conf import subcommand
 from clsplat.cli.flags import grouped_help, near, unknown_flags
 from clsplat.cli.options import Verb
 from clsplat.progress import aligned
+
+if TYPE_CHECKING:
+    from clsplat.cli.session import Services
 
 PROGRAM_DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 VERBS = {
@@ -72,6 +75,13 @@ def verb_class(name: str) -> type[Verb]:
     """Import the dataclass of a verb's arguments, such as `TrainVerb` for "train", BlocksPlanVerb for "blocks plan"."""
     kind: type[Verb] = getattr(verb_module(name), f"{_class_name(name)}Verb")
     return kind
+
+
+def run_function(verb: Verb) -> Callable[[Verb, Services], int]:
+    """Return the function `run` of a verb's module."""
+    name = next(name for name in VERBS if f"{_class_name(name)}Verb" == type(verb).__name__)
+    function: Callable[[Verb, Services], int] = verb_module(name).run
+    return function
 
 
 def _class_name(name: str) -> str:

@@ -14,6 +14,8 @@ from clsplat.files.atomic import check_new
 
 REPORT_FILE_NAME = "report.html"
 """Name of the report's file in a run folder."""
+PLAN_PICTURE_FILE = "plan.svg"
+"""Name, in a run folder, of the picture of the plan by which the scene was trained in blocks."""
 
 
 def check_page(path: Path, *, overwrite: bool) -> None:

@@ -15,12 +15,13 @@ from markupsafe import Markup
 
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import TrainConfig
-from clsplat.errors import amount
+from clsplat.errors import InputError, amount
 from clsplat.evaluation import depths
 from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import read_document
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
-from clsplat.report import REPORT_FILE_NAME, thumbnails
+from clsplat.report import PLAN_PICTURE_FILE, REPORT_FILE_NAME, thumbnails
 from clsplat.report.charts import ChartSeries, chart, short, templates
 from clsplat.report.photographs import SMALL_PICTURE_SIDE_PX, MaskedPhotograph, exposure_chart, masked_photographs
 from clsplat.report.run_numbers import (
@@ -44,6 +45,8 @@ MAX_TABLE_VIEWS = 200
 """Maximum number of views in the table of held-out views."""
 MAX_COLOURED_STAGES = 7
 """Maximum number of stages with a colour of their own in the chart. Smaller stages are drawn together."""
+MAX_PLAN_PICTURE_BYTES = 8 << 20
+"""Size in bytes up to which the picture of a plan is embedded: enough for 80,000 cameras."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 """Title of each score in the tables."""
 
@@ -120,6 +123,7 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
         notes=notes,
         titles=SCORE_TITLES,
         charts=list(filter(None, [*charts(numbers), exposure_chart(numbers.run)])),
+        plan_picture=_plan_picture(numbers.run),
         masks=masks,
         masked_count=masked_count,
         mask_words=_mask_words(use),
@@ -139,6 +143,21 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
         ],
         data=_data(numbers),
     )
+
+
+def _plan_picture(run: Run) -> str:
+    """Return the picture of a run's plan of blocks as a data URI; empty if there is none that can be read.
+
+    As the source of an image, an SVG file can neither run scripts nor load anything.
+    """
+    path = run.path / PLAN_PICTURE_FILE
+    if path.is_symlink() or not path.is_file():  # a link may lead out of the run
+        return ""
+    try:
+        text = read_document(path, "the picture of a plan", MAX_PLAN_PICTURE_BYTES)
+    except InputError:
+        return ""
+    return f"data:image/svg+xml;base64,{base64.b64encode(text.encode()).decode()}"
 
 
 def render_page(name: str, **values: Any) -> str:

@@ -33,12 +33,14 @@ LENS_STAGES = ("lens",)
 """Further stages for training with lens refinement."""
 CHUNK_STAGES = ("bounds", "chunks", "catch_up", "chunk_records")
 """Further stages for training of models of several chunks."""
+REGION_STAGES = ("region",)
+"""Further stage for training of the Gaussians in a region (`clsplat.training.start.Start`)."""
 LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
 """Further stages for the functions of `clsplat.library`."""
 TRAINING_STAGES = (*FORWARD_STAGES, *BACKWARD_STAGES)
 SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
-    *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *CHUNK_STAGES, *LIBRARY_STAGES),
+    *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *CHUNK_STAGES, *REGION_STAGES, *LIBRARY_STAGES),
 )
 INDEX_STAGES = ("project", "duplicate", "sort", "ranges", "append")
 """Stages whose results are indices into the arrays of later stages."""
@@ -76,6 +78,7 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "chunks": (512, "211 measured, in second moments: beta2 in float32 is off by 1.3e-5 of 1 - beta2, up to 216 ulp"),
     "catch_up": (64, "8 measured, in first moments: beta1 in float32 is off by 2.6e-8 in each of 20 steps"),
     "chunk_records": (0, "copies of words"),
+    "region": (0, "each result is copied from one without a region, or is a constant"),
     "ewa": (1024, "95 measured, in the gradient of quaternions, whose terms cancel; else as project_grad"),
     "harmonics": (64, "10 measured; one root and one division"),
     "splats": (64, "2 measured; a root and two quotients"),
@@ -88,11 +91,15 @@ room for GPUs whose divisions and roots do not. If an operation is wrong, result
 """
 
 
-def stages_of_training(config: TrainConfig) -> tuple[str, ...]:
-    """Return the names of the self-test's stages that training with these settings uses."""
+def stages_of_training(config: TrainConfig, *, region: bool = False) -> tuple[str, ...]:
+    """Return the names of the self-test's stages that training with these settings uses.
+
+    region: True if only the Gaussians of a region are trained.
+    """
     return (
         *TRAINING_STAGES,
         *CHUNK_STAGES,
+        *(REGION_STAGES if region else ()),
         *(() if config.mask_use == NO_MASKS else MASK_STAGES),
         *(() if config.appearance == "none" else APPEARANCE_STAGES),
         *(DEPTH_STAGES if config.depth_use else ()),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import re
@@ -222,6 +223,20 @@ def test_no_picture_outside_of_the_run_is_shown(copied: Path) -> None:
 
 
 # What is missing
+
+
+@links
+def test_the_plan_of_blocks_is_an_image_without_scripts(copied: Path, tmp_path: Path) -> None:
+    assert parse(report(copied)).all("figure", id="plan") == []
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg">{SCRIPT}</svg>'
+    (copied / "plan.svg").write_text(svg, "utf-8")
+    html = report(copied)
+    assert SCRIPT not in html
+    source = re.search(r'<figure class="plan" id="plan"><img src="data:image/svg\+xml;base64,([^"]*)"', html)
+    assert source is not None and base64.b64decode(source[1]).decode() == svg
+    (copied / "plan.svg").rename(tmp_path / "away.svg")
+    (copied / "plan.svg").symlink_to(tmp_path / "away.svg")
+    assert 'id="plan"' not in report(copied)
 
 
 def test_views_beyond_the_limit_are_counted(copied: Path) -> None:

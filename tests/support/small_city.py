@@ -12,7 +12,7 @@ from tiny import CONFIG
 
 from clsplat.api import train
 from clsplat.blocks.block_training import LoadScene, TrainRun
-from clsplat.blocks.plan import COARSE_FOLDER, Block, BlockPlan, Division, Rectangle, write_plan
+from clsplat.blocks.plan import COARSE_FOLDER, Block, BlockPlan, Partition, Rectangle, write_plan
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.files.documents import digest
@@ -39,7 +39,7 @@ def write_city(city: Path, scene: Path, device: Device, config: TrainConfig = WH
     plan = BlockPlan(
         scene=scene.absolute(),
         settings=config,
-        division=Division("2"),
+        division=Partition("2"),
         up=(0.0, -1.0, 0.0),
         axes=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
         margin=0.2,

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import Positional, Suppress, arg
 
+from clsplat.cli.blocks.block_options import DivisionOptions
 from clsplat.cli.flags import Groups
-from clsplat.cli.options import Memory, OptionalInt, Output, Verb
+from clsplat.cli.options import Output, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.cli.train import TrainVerb
 from clsplat.cli.training_run import TrainingMachine
@@ -23,7 +24,7 @@ from clsplat.errors import InputError, warn
 from clsplat.progress import StageProgress, aligned
 
 if TYPE_CHECKING:
-    from clsplat.blocks.plan import BlockPlan, Division, Point
+    from clsplat.blocks.plan import BlockPlan, Partition, Point
     from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
 
@@ -54,14 +55,7 @@ class BlocksPlanVerb(Verb):
     blocks: Annotated[str, arg(metavar="auto|N|NxM")] = "auto"
     """Number of blocks, or numbers along both axes of the ground. auto: as few as --block-mem and --block-photographs
     allow."""
-    block_mem: Memory = None
-    """Device memory that the training of a block may take, such as 8GiB: that of the smallest device. If not given: the
-    memory of this device."""
-    block_photographs: OptionalInt = None
-    """Largest number of photographs of a block. If not given: any number."""
-    up: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """Up direction in the scene's world, such as 0,0,1. If not given: -y of an upright scene (--orient up), else an
-    estimate from the points and the cameras."""
+    limits: Annotated[DivisionOptions, arg(name="")] = field(default_factory=DivisionOptions)
     device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
     preset: Preset = "default"
     """Bundle of settings, as for clsplat train."""
@@ -96,7 +90,7 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     """Make the plan. Errors in the command line are reported before anything is written."""
     from clsplat.blocks.plan import PLAN_FILE
     from clsplat.blocks.plan_check import check_new_plan, kept_plan
-    from clsplat.blocks.planning import coarse_run
+    from clsplat.blocks.planning.new_plan import coarse_run
 
     division, up = _checked(verb)
     city = verb.output
@@ -117,22 +111,24 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     return 0
 
 
-def _checked(verb: BlocksPlanVerb) -> tuple[Division, Point | None]:
+def _checked(verb: BlocksPlanVerb) -> tuple[Partition, Point | None]:
     """Check the flags. Returns the options of the division, and the up direction if it is given."""
-    from clsplat.blocks.ground import parse_up
-    from clsplat.blocks.plan import Division
-    from clsplat.blocks.split import parse_blocks
+    from clsplat.blocks.plan import Partition
+    from clsplat.blocks.planning.ground import parse_up
+    from clsplat.blocks.planning.split import parse_blocks
 
     parse_blocks(verb.blocks)
-    for flag, value in (("--block-mem", verb.block_mem), ("--block-photographs", verb.block_photographs)):
+    limits = verb.limits
+    for flag, value in (("--block-mem", limits.block_mem), ("--block-photographs", limits.block_photographs)):
         if value is not None and verb.blocks != "auto":
             raise InputError(f"{flag} {value} and --blocks {verb.blocks} exclude each other, expected --blocks auto")
-    if verb.block_photographs is not None and verb.block_photographs < MIN_BLOCK_PHOTOGRAPHS:
-        raise InputError(f"--block-photographs {verb.block_photographs}: expected at least {MIN_BLOCK_PHOTOGRAPHS}")
+    if limits.block_photographs is not None and limits.block_photographs < MIN_BLOCK_PHOTOGRAPHS:
+        raise InputError(f"--block-photographs {limits.block_photographs}: expected at least {MIN_BLOCK_PHOTOGRAPHS}")
     verb.device.check()
     verb.config.check()
-    memory = parse_bytes(verb.block_mem, "--block-mem")
-    return Division(verb.blocks, memory, verb.block_photographs), parse_up(verb.up) if verb.up is not None else None
+    memory = parse_bytes(limits.block_mem, "--block-mem")
+    up = parse_up(limits.up) if limits.up is not None else None
+    return Partition(verb.blocks, memory, limits.block_photographs), up
 
 
 def _scene(verb: BlocksPlanVerb, services: Services, coarse: Run | None) -> tuple[Scene, TrainConfig]:
@@ -157,9 +153,9 @@ def _trained(verb: BlocksPlanVerb, services: Services, coarse: Run | None, scene
     coarse: the run if it has begun before.
     scene, config: the scene at the size of the whole, and the settings of the whole.
     """
-    from clsplat.blocks.coarse import coarse_settings
     from clsplat.blocks.plan import COARSE_FOLDER
     from clsplat.blocks.plan_check import check_coarse
+    from clsplat.blocks.planning.coarse import coarse_settings
     from clsplat.cli import train
     from clsplat.runs.run import Run
 
@@ -183,19 +179,20 @@ def _made(
     coarse: Run,
     scene: Scene,
     config: TrainConfig,
-    options: tuple[Division, Point | None],
+    options: tuple[Partition, Point | None],
 ) -> BlockPlan:
     """Divide the scene with the coarse model, and write the plan and its picture.
 
     options: options of the division, and the up direction if it is given.
     """
-    from clsplat.blocks.ground import ground_of
-    from clsplat.blocks.measurement import LoadMeasurement
-    from clsplat.blocks.picture import plan_svg
-    from clsplat.blocks.plan import PLAN_PICTURE_FILE, write_plan
-    from clsplat.blocks.planning import coarse_cameras, made_plan
+    from clsplat.blocks.plan import write_plan
+    from clsplat.blocks.planning.ground import ground_of
+    from clsplat.blocks.planning.measurement import LoadMeasurement
+    from clsplat.blocks.planning.new_plan import coarse_cameras, made_plan
+    from clsplat.blocks.planning.picture import plan_svg
     from clsplat.files.atomic import atomic_write
     from clsplat.gaussians import Gaussians
+    from clsplat.report import PLAN_PICTURE_FILE
     from clsplat.selftest.result import stages_of_training
 
     division, up = options
@@ -214,8 +211,8 @@ def _made(
 
 def _tell(city: Path, plan: BlockPlan) -> None:
     """Print the table of blocks, and where the plan is."""
-    from clsplat.blocks.picture import plan_table, plan_total
     from clsplat.blocks.plan import PLAN_FILE
+    from clsplat.blocks.planning.picture import plan_table, plan_total
 
     print("\n".join(aligned(plan_table(plan))))
     print(plan_total(plan))

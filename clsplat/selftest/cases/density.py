@@ -16,6 +16,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SPLAT
 from clsplat.optimisation.density_rules import MarkRules
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.reference import density as reference
 from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, faults
 from clsplat.selftest.harness import WHITENING_FACTOR, CaseBench, StageOutcome
@@ -25,6 +26,8 @@ from clsplat.stages.device_gaussians import to_host, upload_gaussians
 from clsplat.stages.project import Projected, Screen
 
 MARK_RULES = MarkRules(gradient=2.0, cut_off=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5)
+MARKED_REGION = TrainedRegion(np.eye(3)[:2], np.array([0.0, -np.inf]), np.array([1.0, 0.25]))
+"""Region whose edges are coordinates of some Gaussians."""
 MIN_RADIUS_MARGIN = 1e-4
 """Relative distance of a radius from a whole number of pixels. Below it, rounding errors may change the radius when it
 is rounded up to whole pixels."""
@@ -108,8 +111,10 @@ def _random_marks(rng: Generator, count: int) -> Inputs:
     statistics["seen"] = rng.integers(0, 4, count).astype(np.float32)
     further = replace(MARK_RULES, radius=4.0, contribution=0.25 if wide else -np.inf)
     zeros = np.zeros((count, 4), np.float32)
-    gaussians = Gaussians(*(zeros[:, :3], zeros, values(0.5, 1.5, 2, size=(count, 3)), values(-1), zeros[:, None, :3]))
-    rules = (MarkRules(), MARK_RULES, further, replace(further, gradient=0.0, cut_off=(-np.inf, 0)))
+    means = rng.choice([-0.5, 0, 0.25, 1, np.nan], (count, 3)).astype(np.float32)
+    gaussians = Gaussians(*(means, zeros, values(0.5, 1.5, 2, size=(count, 3)), values(-1), zeros[:, None, :3]))
+    of_region = replace(further, region=MARKED_REGION)
+    rules = (MarkRules(), MARK_RULES, further, replace(further, gradient=0.0, cut_off=(-np.inf, 0)), of_region)
     return Inputs(statistics=statistics, gaussians=gaussians, rules=rules, streamed=bool(rng.random() < 0.5))
 
 
@@ -128,8 +133,9 @@ def _launch_marks(device: Device, work: Workspace, given: Inputs) -> Read:
 def _twin_of_marks(given: Inputs, _: Arrays) -> dict[str, Expected]:
     known, gaussians, wanted = given.statistics, given.gaussians, {}
     for index, rules in enumerate(given.rules):
-        rows, halves = reference.rows(rules, known, gaussians.log_scales, gaussians.opacity_logits)
-        wanted[f"scores {index}"] = exactly(reference.scores(rules, known))
+        arrays = (gaussians.means, gaussians.log_scales, gaussians.opacity_logits)
+        rows, halves = reference.rows(rules, known, *arrays)
+        wanted[f"scores {index}"] = exactly(reference.scores(rules, known, gaussians.means))
         wanted |= {f"rows {index}": exactly(rows), f"halves {index}": exactly(np.array([halves]))}
     return wanted
 

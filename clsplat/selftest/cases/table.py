@@ -17,6 +17,7 @@ from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.primitives import APPEND_CASE, BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
+from clsplat.selftest.cases.region import REGION_CASE
 from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE, SETTLE_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
 
@@ -37,6 +38,7 @@ CASES: dict[str, Case] = {
     "catch_up": CATCH_UP_CASE,
     "chunk_records": CHUNK_RECORDS_CASE,
     "noise": NOISE_CASE,
+    "region": REGION_CASE,
     **COLOUR_CASES,
     "grid": GRID_CASE,
     "pose": POSE_CASE,

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from clsplat.arrays import Bool, Float32, Float64
-from clsplat.blocks.ground import Ground, on_ground
-from clsplat.blocks.loads import CellBins, belonging, places_seen
 from clsplat.blocks.plan import MARGIN, SHARE, Rectangle
-from clsplat.blocks.split import Tree, bounds_of, cells, widened
+from clsplat.blocks.planning.ground import Ground, on_ground
+from clsplat.blocks.planning.loads import CellBins, belonging, places_seen
+from clsplat.blocks.planning.split import Tree, bounds_of, cells, widened
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Division of the ground into cells: a k-d tree over the places that photographs show.
+"""Partition of the ground into cells: a k-d tree over the places that photographs show.
 
 The outer cells have no outer edges. So the cells cover the plane, and each point is in exactly one of them.
 """
@@ -28,7 +28,7 @@ class Leaf:
 
 
 @dataclass(frozen=True)
-class Cut:
+class GroundCut:
     """A cut of a part of the plane in two.
 
     axis: 0 or 1, the axis along which the coordinate is compared with `at`.
@@ -41,7 +41,7 @@ class Cut:
     above: Tree
 
 
-Tree = Leaf | Cut
+Tree = Leaf | GroundCut
 PLANE = Rectangle((-inf, -inf), (inf, inf))
 """The whole plane."""
 
@@ -87,13 +87,13 @@ def gridded(places: Float64, columns: int, rows: int) -> Tree:
             return Leaf(f"{within}_{first}") if within is not None else parts(some, 1, 0, rows, first)
         low = some[:, axis] < at
         below = parts(some[low], axis, first, count // 2, within)
-        return Cut(axis, at, below, parts(some[~low], axis, first + count // 2, count - count // 2, within))
+        return GroundCut(axis, at, below, parts(some[~low], axis, first + count // 2, count - count // 2, within))
 
     return parts(places, 0, 0, columns, None)
 
 
 def cut_again(tree: Tree, names: Sequence[str], places: Float64) -> Tree:
-    """Cut each of the named cells in two, and number all cells anew. A cell whose places are all equal stays.
+    """GroundCut each of the named cells in two, and number all cells anew. A cell whose places are all equal stays.
 
     places: (P, 2), coordinates on the ground.
     """
@@ -163,7 +163,7 @@ def _halved(places: Float64, count: int) -> Tree:
         at = _cut(places[:, axis], count // 2, count)
         if at is not None:
             low = places[:, axis] < at
-            return Cut(axis, at, _halved(places[low], count // 2), _halved(places[~low], count - count // 2))
+            return GroundCut(axis, at, _halved(places[low], count // 2), _halved(places[~low], count - count // 2))
     return Leaf("")
 
 

@@ -8,10 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.coarse import block_steps, finish_steps
-from clsplat.blocks.measurement import CellLoads, LoadMeasurement
-from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Division
-from clsplat.blocks.split import MAX_BLOCKS, Leaf, Tree, balanced, cells, cut_again, gridded, parse_blocks, without
+from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Partition
+from clsplat.blocks.planning.coarse import block_steps, finish_steps
+from clsplat.blocks.planning.measurement import CellLoads, LoadMeasurement
+from clsplat.blocks.planning.split import (
+    MAX_BLOCKS,
+    Leaf,
+    Tree,
+    balanced,
+    cells,
+    cut_again,
+    gridded,
+    parse_blocks,
+    without,
+)
 from clsplat.camera import Camera
 from clsplat.errors import InputError, amount, examples
 from clsplat.files.documents import known_digest
@@ -25,7 +35,7 @@ MIN_LOAD_DROP = 0.95
 """Cuts for a limit go on as long as each round multiplies the largest load by at most this factor."""
 
 
-def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division: Division) -> BlockPlan:
+def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division: Partition) -> BlockPlan:
     """Divide a scene into blocks, and measure their loads.
 
     coarse: run of the coarse model.
@@ -33,7 +43,7 @@ def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division:
     Raises InputError for limits that no division meets.
     """
     config, photographs = measurement.config, [view.name for view in measurement.scene.train_views]
-    loads, joined = _joined(measurement, _divided(measurement, division))
+    loads, joined = divided(measurement, division)
     blocks = []
     for index, name in enumerate(loads.names):
         own = tuple(photographs[photograph] for photograph in np.flatnonzero(loads.belongs[:, index]))
@@ -72,14 +82,20 @@ def coarse_cameras(coarse: Run, scene: Scene) -> list[Camera]:
     return [view.camera.resized(*sizes[view.name]) if view.name in sizes else view.camera for view in scene.train_views]
 
 
-def _divided(measurement: LoadMeasurement, division: Division) -> Tree:
-    """Divide the ground into the number of cells that `division` asks for. For "auto", its limits decide."""
+def divided(measurement: LoadMeasurement, division: Partition) -> tuple[CellLoads, list[str]]:
+    """Divide the ground into the cells that `division` asks for, and measure their loads.
+
+    For "auto", there are as few cells as the limits allow. Cells that cannot be trained are joined to their neighbours.
+    Returns the loads, and a line for each cell that was joined. Raises InputError for limits that no division meets.
+    """
     asked = parse_blocks(division.blocks)
     if isinstance(asked, tuple):
-        return gridded(measurement.places, *asked)
-    if asked is not None:
-        return balanced(measurement.places, asked)
-    return _within(measurement, division.memory or measurement.device.budget, division.photographs)
+        tree = gridded(measurement.places, *asked)
+    elif asked is not None:
+        tree = balanced(measurement.places, asked)
+    else:
+        tree = _within(measurement, division.memory or measurement.device.budget, division.photographs)
+    return _joined(measurement, tree)
 
 
 def _within(measurement: LoadMeasurement, memory: int, most: int | None) -> Tree:
@@ -137,8 +153,8 @@ def _joined(measurement: LoadMeasurement, tree: Tree) -> tuple[CellLoads, list[s
 def _unfit(measurement: LoadMeasurement, loads: CellLoads, index: int) -> str:
     """Return in words why a cell cannot be trained; empty if it can."""
     own = measurement.camera_places[loads.belongs[:, index]]
-    if not len(own):
-        return "no photographs"
     if not loads.inside[index]:
         return "no points"
+    if not len(own):
+        return "no photographs"
     return "one camera" if len(np.unique(own, axis=0)) < MIN_CAMERA_PLACES else ""

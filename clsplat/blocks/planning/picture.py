@@ -10,8 +10,8 @@ from math import isfinite
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.blocks.ground import on_ground
 from clsplat.blocks.plan import Block, BlockPlan, Pair, Rectangle
+from clsplat.blocks.planning.ground import on_ground
 
 PICTURE_SIDE_PX = 640
 """Longer side of the map in a plan's picture, in pixels."""
@@ -23,7 +23,7 @@ BORDER_PART = 0.06
 """Width of the border around all cameras and cuts on the map, as a fraction of their longer side."""
 CELL_COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f")
 """Colours of cells, which repeat after the eighth."""
-CAMERA_COLOURS = ("#8a8a8a", "#1b1b1b", "#b23a00", "#d40078")
+PLAN_CAMERA_COLOURS = ("#8a8a8a", "#1b1b1b", "#b23a00", "#d40078")
 """Colours of cameras whose photographs belong to no block, one, two, and three or more."""
 DETAILS_SIDE_PX = 110
 """Least width and height in pixels of a cell on the map that has room for its loads."""
@@ -74,7 +74,7 @@ def plan_svg(plan: BlockPlan, cameras: Mapping[str, Float64]) -> str:
     bottom = height + 2 * PICTURE_EDGE_PX
     counts = Counter(min(times[name], 3) for name in cameras)
     known = ("in no block", "in 1 block", "in 2 blocks", "in 3 or more blocks")
-    legend = [(CAMERA_COLOURS[key], f"{counts[key]:,} cameras {known[key]}") for key in range(4) if counts[key]]
+    legend = [(PLAN_CAMERA_COLOURS[key], f"{counts[key]:,} cameras {known[key]}") for key in range(4) if counts[key]]
     lines = [_text(plan_total(plan), PICTURE_EDGE_PX, bottom)]
     for number, (colour, text) in enumerate(legend, 1):
         y = bottom + CAPTION_LINE_PX * number
@@ -117,7 +117,7 @@ def _outline(widened: Rectangle, color: str, pixel: Callable[[Pair], Pair]) -> s
 
 
 def _dot(at: Pair, blocks: int = 0, *, color: str | None = None) -> str:
-    color = color or CAMERA_COLOURS[min(blocks, 3)]
+    color = color or PLAN_CAMERA_COLOURS[min(blocks, 3)]
     return f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="3" fill="{color}" fill-opacity="0.8"/>'
 
 

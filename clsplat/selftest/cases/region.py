@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Case of the region of a training (kernels/shared/region.h): results outside it, and inside it those without one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.random import Generator
+
+from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import SlotFields
+from clsplat.optimisation.step_noise import Exploration
+from clsplat.optimisation.trained_region import TrainedRegion
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback
+from clsplat.selftest.cases.steps import ADAM_RATES, random_scene
+from clsplat.selftest.harness import CaseBench
+from clsplat.selftest.scenes import evenly
+from clsplat.stages.adam import AdamStep
+from clsplat.stages.device_camera import pack_camera, upload_cameras
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
+from clsplat.stages.noise import noise
+from clsplat.stages.project import Screen, Slots, project, project_grad, project_step
+from clsplat.stages.sampling import sampling_limits
+
+FIELDS = SlotFields(contributions=True)
+NO_LIMIT = np.float32(-1e30)
+"""Lower limit of the log scales of a Gaussian that has no limit."""
+
+
+def _random(rng: Generator, count: int) -> Inputs:
+    """A random view, and a region with a Gaussian on each of its edges. slots: (n, FIELDS.floats), summed by
+    Gaussian."""
+    given = random_scene(rng, count)
+    axes = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+    means = given.gaussians.means
+    at = TrainedRegion(axes, np.full(2, -np.inf), np.full(2, np.inf)).coordinates(means).astype(np.float64)
+    low, high = np.sort(at, axis=0)[[count // 5, -1 - count // 5]]
+    high[1] = np.inf
+    means[rng.random(count) < 0.02] = np.nan
+    high = np.where(low < high, high, low + 1)
+    return Inputs(
+        **vars(given),
+        region=TrainedRegion(axes, low, high),
+        slots=rng.normal(size=(count, FIELDS.floats)).astype(np.float32),
+        sparse=bool(rng.random() < 0.3),
+    )
+
+
+def _frozen(bench: CaseBench) -> list[Inputs]:
+    gaussians, count = bench.frozen.gaussians, bench.model.count
+    axes = np.array([[0.75, 0.5, 0.0], [0.0, 0.25, 0.5]])
+    region = TrainedRegion(axes, np.full(2, -np.inf), np.full(2, np.inf))
+    low, high = np.quantile(region.coordinates(gaussians.means), (0.2, 0.8), axis=0)
+    return [
+        Inputs(
+            gaussians=gaussians,
+            camera=bench.camera,
+            explore=Exploration(opacity=0.3125, scale=0.6875),
+            region=replace(region, low=low, high=high),
+            slots=evenly(47, (count, FIELDS.floats), -0.5, 0.5).astype(np.float32),
+            sparse=False,
+        )
+    ]
+
+
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
+    """Run the kernels with a region and without one."""
+    camera_array, cameras = upload(device, pack_camera(given.camera)), upload_cameras(device, [given.camera])
+    reads: dict[str, Read] = {}
+    for name, region in (("", None), ("in region ", given.region)):
+        model = upload_gaussians(device, given.gaussians)
+        projected = project(device, work, model, given.camera, camera_array)
+        count, coefficients = model.count, model.coefficients
+        nan = np.full(3 * count, np.nan, np.float32)
+        screen = Screen(upload(device, nan[: 2 * count].reshape(-1, 2)), upload(device, nan[:count]))
+        view = (camera_array, projected, Slots(upload(device, given.slots), None, FIELDS))
+        gradients = allocate_gaussians(device, count, coefficients, zero=True)
+        project_grad(device, model, *view, gradients, screen, explore=given.explore, region=region)
+        least = allocate(device, (count,), np.float32)
+        sampling_limits(device, work, model, cameras, least, region)
+        shaken = upload_gaussians(device, given.gaussians)
+        noise(device, Exploration(amount=1e3, dead=1.0, key=(3, 5)), shaken, 0, fresh_readback(device), region)
+        moments = [allocate_gaussians(device, count, coefficients, zero=True) for _ in range(2)]
+        step = AdamStep(OptimiserConfig(sparse=given.sparse), 1, ADAM_RATES)
+        stepped = Screen(upload(device, nan[: 2 * count].reshape(-1, 2)), upload(device, nan[:count]))
+        moved = (upload_gaussians(device, given.gaussians), *moments)
+        readback = fresh_readback(device)
+        project_step(device, step, moved, *view, stepped, readback, explore=given.explore, region=region)
+        arrays = {f"gradients of {group}": gradients[group] for group in PARAMETER_GROUPS}
+        arrays |= {f"new {group}": moved[0][group] for group in PARAMETER_GROUPS}
+        arrays |= {
+            "screen": screen.gradients,
+            "contributions": screen.contributions,
+            "screen of step": stepped.gradients,
+        }
+        arrays |= {"limits": least, "moved means": shaken["means"], "counts": projected.tile_counts}
+        reads |= {f"{name}{key}": array for key, array in arrays.items()}
+    return lambda: {name: array.get() for name, array in reads.items()}
+
+
+def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
+    """Inside the region, results are those without a region. Outside, gradients are zero, and parameters stay.
+
+    Results without a region come from the device, because other stages test them.
+    """
+    inside, shown, held = given.region.contains(given.gaussians.means), got["counts"] > 0, given.gaussians
+    before = {f"new {group}": getattr(held, group) for group in list(PARAMETER_GROUPS)[:4]}
+    before |= {"new sh_dc": held.sh[:, 0], "new sh_rest": held.sh[:, 1:], "moved means": held.means}
+    wanted: dict[str, Expected] = {}
+    for name in [name for name in got if f"in region {name}" in got and name != "counts"]:
+        array = got[name]
+        outside = before[name] if name in before else np.full_like(array, NO_LIMIT if name == "limits" else 0)
+        values = np.where(inside.reshape(-1, *[1] * (array.ndim - 1)), array, outside)
+        seen = shown if name in ("screen", "contributions", "screen of step") else np.ones_like(shown)
+        got[f"in region {name}"] = np.where(np.isnan(both := got[f"in region {name}"]), 0, both)[seen]
+        wanted[f"in region {name}"] = exactly(np.where(np.isnan(values), 0, values)[seen])
+    return wanted
+
+
+REGION_CASE = Case(
+    sizes=(1, 9, 65, 203, 7, 8, 63, 64, 129),
+    random=_random,
+    launch=_launch,
+    twin=_twin,
+    frozen=_frozen,
+    digested=("in region gradients of means", "in region screen", "in region limits", "in region moved means"),
+)

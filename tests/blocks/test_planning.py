@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocks by number, by limits and by what can be trained, with given contributions in place of a coarse model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.blocks.plan import Partition
+from clsplat.blocks.planning.measurement import LoadMeasurement
+from clsplat.blocks.planning.new_plan import divided
+from clsplat.errors import InputError
+
+STREET_METRES = 100
+
+
+class GivenLoads(LoadMeasurement):
+    """Photographs along a street: each shows the Gaussians up to `reach` metres from its camera equally.
+
+    cameras: places of the cameras along the street. gaussians: places of the Gaussians.
+    """
+
+    def __init__(self, cameras: Any, gaussians: Any, reach: float) -> None:
+        super().__init__(*cast("tuple[Any, Any, Any, Any, Any, Any]", [None] * 6))
+        self.along, self.reach, self.passes = np.asarray(gaussians, float), reach, 0
+        self.__dict__["camera_places"] = on_street(cameras)
+        self.__dict__["coordinates"] = on_street(gaussians)
+
+    def bytes_needed(self, gaussians: float) -> int:
+        return round(10 * gaussians)
+
+    def _contributions(self, text: str) -> Iterator[Float32]:
+        assert text
+        self.passes += 1
+        for place in self.camera_places[:, 0]:
+            yield (np.abs(self.along - place) <= self.reach).astype(np.float32)
+
+
+def on_street(places: Any) -> NDArray[np.float64]:
+    return np.stack([np.asarray(places, float), np.zeros(len(places))], axis=1)
+
+
+def street(reach: float = 5.0) -> GivenLoads:
+    """A camera every two metres, and a Gaussian every half."""
+    return GivenLoads(np.arange(0, STREET_METRES, 2), np.arange(0, STREET_METRES, 0.5), reach)
+
+
+@pytest.mark.parametrize("blocks", ["1", "3", "4", "2x1", "4x2"])
+def test_every_photograph_belongs_to_a_block(blocks: str) -> None:
+    loads, notes = divided(street(), Partition(blocks))
+    assert notes == []
+    assert len(loads.names) == (4 if blocks == "4x2" else int(np.prod([int(word) for word in blocks.split("x")])))
+    assert loads.belongs.any(axis=1).all()
+    assert loads.inside.sum() == STREET_METRES / 0.5
+    assert (loads.around >= loads.inside).all()
+
+
+def test_photographs_near_a_cut_belong_to_both_sides() -> None:
+    loads, _ = divided(street(), Partition("2"))
+    # the cut is at 49 m, and a photograph shows 21 Gaussians: that at 46 m has 5 of them beyond the cut, that at 52 m 4
+    both = np.flatnonzero(loads.belongs.all(axis=1))
+    assert (2 * both).tolist() == [46, 48, 50]
+
+
+def test_auto_is_one_block_if_everything_fits() -> None:
+    measured = GivenLoads(np.arange(0, STREET_METRES, 2), np.arange(0, STREET_METRES, 0.5), 5.0)
+    loads, _ = divided(measured, Partition("auto", memory=10 * 200))
+    assert loads.names == ("0_0",)
+    assert measured.passes == 2  # for the places, and for the loads
+
+
+def test_auto_cuts_until_the_limits_are_met() -> None:
+    loads, _ = divided(street(), Partition("auto", memory=10 * 75))
+    assert loads.around.max() <= 75 and len(loads.names) == 4
+    loads, _ = divided(street(), Partition("auto", memory=10**6, photographs=16))
+    assert loads.belongs.sum(axis=0).max() <= 16
+    assert len(loads.names) <= 5  # 50 photographs, and a few in two blocks at each of the cuts
+
+
+def test_limits_that_no_division_meets_are_refused() -> None:
+    wide = street(reach=1000.0)  # each photograph shows the whole street
+    with pytest.raises(InputError, match=r"--block-photographs 20: the largest of \d blocks would still have 50 photo"):
+        divided(wide, Partition("auto", memory=10**6, photographs=20))
+    heap = GivenLoads(np.arange(0, STREET_METRES, 2), np.full(300, 50.0), 60.0)
+    with pytest.raises(InputError, match=r"--block-mem 100 bytes: the largest of \d blocks? would still take"):
+        divided(heap, Partition("auto", memory=100))
+
+
+def test_a_cell_without_points_is_joined() -> None:
+    cameras = np.arange(0, STREET_METRES, 2)
+    half = GivenLoads(cameras, np.arange(0, STREET_METRES / 2, 0.5), 5.0)  # nothing is known of the street's other half
+    loads, notes = divided(half, Partition("4x1"))
+    assert notes == ["block 3,0 has no points: its cell is joined to block 2,0"]
+    assert loads.names == ("0_0", "1_0", "2_0")
+    assert loads.cells[-1].high[0] == np.inf
+    assert loads.inside.min() > 0 and loads.belongs.any(axis=0).all()
+
+
+def test_a_cell_with_one_camera_is_joined() -> None:
+    cameras = [0.0, 1.0, 2.0, 3.0, 20.0, 20.0, 20.0, 20.0]
+    loads, notes = divided(GivenLoads(cameras, np.arange(0, 24, 0.5), 2.0), Partition("2"))
+    assert notes == ["block 1,0 has one camera: its cell is joined to block 0,0"]
+    assert loads.names == ("0_0",) and loads.belongs.all()
+
+
+def test_a_cell_without_photographs_is_joined() -> None:
+    class AsidePlaces(GivenLoads):
+        """As if half of the photographs showed a place where only a small part of their pixels is."""
+
+        def _contributions(self, text: str) -> Iterator[Float32]:
+            for weights in super()._contributions(text):
+                far = np.where(self.along > 50, 0.01 if text.startswith("measuring") else 0.0, 1.0)
+                yield (weights * far).astype(np.float32)
+
+    loads, notes = divided(AsidePlaces(np.arange(0, 80, 2), np.arange(0, 80, 0.5), 40.0), Partition("1"))
+    assert notes == [] and loads.belongs.all()
+    measured = AsidePlaces(np.arange(0, 80, 2), np.arange(0, 80, 0.5), 40.0)
+    measured.__dict__["places"] = on_street(np.arange(0, 80, 2) + 25.0)
+    loads, notes = divided(measured, Partition("2"))
+    assert notes == ["block 1,0 has no photographs: its cell is joined to block 0,0"]
