@@ -77,7 +77,10 @@ class Killed:
         """Kill processes `count` times, and start what is missing after each kill."""
         while self.kills.total() < self.count:
             self._start()
-            time.sleep(self.chance.uniform(0.0, 2.5))
+            before, until = self._counted(), time.monotonic() + self.chance.uniform(0.0, 20.0)
+            while self._counted() == before and time.monotonic() < until:
+                time.sleep(0.02)
+            time.sleep(self.chance.uniform(0.0, 1.5))
             kinds = ["dispatcher", "command", "attempt", *(["worker", "scheduler"] if self.cluster else [])]
             kind = self.chance.choice(kinds)
             with suppress(OSError, ValueError, KeyError):  # the process has just ended
@@ -115,6 +118,10 @@ class Killed:
             self.dispatcher.wait()
         if self.cluster is not None:
             self.cluster.close()
+
+    def _counted(self) -> int:
+        """Number of steps that are counted in all files."""
+        return sum(counting.counted(self.folder, str(number)) for number in range(TASKS))
 
     def _start(self) -> None:
         """Start the scheduler, the workers and the dispatcher, if they do not run."""
