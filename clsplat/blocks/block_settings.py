@@ -11,7 +11,7 @@ from clsplat.config.depth import DEPTH_WEIGHT_END_FRACTION
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.training.learning_rates import means_rate_at
 
-FINISH_APPEARANCE_RATE = 0.1
+FINISH_APPEARANCE_RATE = 0.03
 """Learning rate of appearance in the finish, as a fraction of the setting. The finish begins with appearances that
 need small corrections only."""
 FINISH_COOLDOWN_TO = 0.1
