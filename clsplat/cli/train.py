@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, Suppress, arg
 
+from clsplat.cli.blocks.block_options import WholeInBlocks
 from clsplat.cli.eval import print_summary
 from clsplat.cli.options import Flag, OptionalInt, Output, PageOptions, Verb, with_given
 from clsplat.cli.session import Services, load_scene
@@ -54,6 +55,7 @@ class TrainVerb(Verb):
     view: Flag = False
     """Show the growing model on a page in the browser, where training can be paused too (see clsplat view)."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
+    blocks: Annotated[WholeInBlocks, arg(name="")] = field(default_factory=WholeInBlocks)
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -77,12 +79,24 @@ class TrainVerb(Verb):
     def completed(self, given: Collection[str]) -> TrainVerb:
         """Return the arguments with the settings of the resumed run, or of preset and schedule. Flags that are `given`
         override these. A batch of 1 becomes one view per device."""
+        if self.resume and self.in_blocks:
+            return replace(self, given=frozenset(given))
         verb = self._with_settings(given)
         if "points" in given and verb.config.points:  # an absolute path, so that the run can be resumed from any folder
             verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))
         explicit = self.resume or "batch" in given
         config = verb.config.on_devices(self.device.count, explicit=explicit)
         return replace(verb, config=config, given=frozenset(given))
+
+    @property
+    def in_blocks(self) -> bool:
+        """True if the scene is trained in blocks: with --blocks, or if the output folder has a plan."""
+        from clsplat.blocks.plan import COARSE_FOLDER, PLAN_FILE
+        from clsplat.runs.run import is_run
+
+        if self.blocks.blocks is not None:
+            return True
+        return (self.output / PLAN_FILE).exists() or is_run(self.output / COARSE_FOLDER)
 
     def _with_settings(self, given: Collection[str]) -> TrainVerb:
         if self.passes is not None:
@@ -107,6 +121,13 @@ class TrainVerb(Verb):
         return replace(self, config=with_given(Run.open(self.output).config, self.config, given))
 
 
+def _check_not_in_blocks(verb: TrainVerb) -> None:
+    """Raise InputError for a flag that only --blocks uses."""
+    for name in ("block_mem", "block_photographs", "up", "workers", "scheduler", "finish"):
+        if (value := getattr(verb.blocks, name)) is not None:
+            raise InputError(f"--{name.replace('_', '-')} {value}: is for trainings in blocks, expected --blocks too")
+
+
 def _check_used(config: TrainConfig, given: Collection[str]) -> None:
     """Raise InputError for a flag whose feature is off, such as --pose-reach without --refine-poses."""
     for name, used, why, wanted in (
@@ -123,6 +144,11 @@ def _check_used(config: TrainConfig, given: Collection[str]) -> None:
 
 def run(verb: TrainVerb, services: Services) -> int:
     """Train a new run or resume one. Errors in the command line are reported before the run's folder is changed."""
+    if verb.in_blocks:
+        from clsplat.cli.blocks import whole
+
+        return whole.run(verb, services)
+    _check_not_in_blocks(verb)
     from clsplat.runs.locks import locked
     from clsplat.runs.run import check_output, is_run
 

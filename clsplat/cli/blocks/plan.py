@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import Positional, Suppress, arg
 
+from clsplat.cli.blocks.block_options import DivisionOptions
 from clsplat.cli.flags import Groups
-from clsplat.cli.options import Memory, OptionalInt, Output, Verb
+from clsplat.cli.options import Output, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.cli.train import TrainVerb
 from clsplat.cli.training_run import TrainingMachine
@@ -54,14 +55,7 @@ class BlocksPlanVerb(Verb):
     blocks: Annotated[str, arg(metavar="auto|N|NxM")] = "auto"
     """Number of blocks, or numbers along both axes of the ground. auto: blocks are halved until each is within
     --block-mem and --block-photographs."""
-    block_mem: Memory = None
-    """Device memory that the training of a block may take, such as 8GiB: that of the smallest device. If not given: the
-    memory of this device."""
-    block_photographs: OptionalInt = None
-    """Largest number of photographs of a block. If not given: any number."""
-    up: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """Up direction in the scene's world, such as 0,0,1. If not given: -y of an upright scene (--orient up), else an
-    estimate from the points and the cameras."""
+    limits: Annotated[DivisionOptions, arg(name="")] = field(default_factory=DivisionOptions)
     device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
     preset: Preset = "default"
     """Bundle of settings, as for clsplat train."""
@@ -124,15 +118,17 @@ def _checked(verb: BlocksPlanVerb) -> tuple[Partition, Point | None]:
     from clsplat.blocks.planning.split import parse_blocks
 
     parse_blocks(verb.blocks)
-    for flag, value in (("--block-mem", verb.block_mem), ("--block-photographs", verb.block_photographs)):
+    limits = verb.limits
+    for flag, value in (("--block-mem", limits.block_mem), ("--block-photographs", limits.block_photographs)):
         if value is not None and verb.blocks != "auto":
             raise InputError(f"{flag} {value} and --blocks {verb.blocks} exclude each other, expected --blocks auto")
-    if verb.block_photographs is not None and verb.block_photographs < MIN_BLOCK_PHOTOGRAPHS:
-        raise InputError(f"--block-photographs {verb.block_photographs}: expected at least {MIN_BLOCK_PHOTOGRAPHS}")
+    if limits.block_photographs is not None and limits.block_photographs < MIN_BLOCK_PHOTOGRAPHS:
+        raise InputError(f"--block-photographs {limits.block_photographs}: expected at least {MIN_BLOCK_PHOTOGRAPHS}")
     verb.device.check()
     verb.config.check()
-    memory = parse_bytes(verb.block_mem, "--block-mem")
-    return Partition(verb.blocks, memory, verb.block_photographs), parse_up(verb.up) if verb.up is not None else None
+    memory = parse_bytes(limits.block_mem, "--block-mem")
+    up = parse_up(limits.up) if limits.up is not None else None
+    return Partition(verb.blocks, memory, limits.block_photographs), up
 
 
 def _scene(verb: BlocksPlanVerb, services: Services, coarse: Run | None) -> tuple[Scene, TrainConfig]:
