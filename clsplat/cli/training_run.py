@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
     from clsplat.training.start import Start
     from clsplat.viewer.training_view import TrainingView
+
+TrainingProgress = Literal["auto", "openjd"]
+"""How the progress of a training is written, as for `TrainProgress`."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,13 @@ def train_run(
     machine: TrainingMachine,
     *,
     start: Start | None = None,
+    progress: TrainingProgress = "auto",
     page: Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]] | None = None,
 ) -> None:
     """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
 
     start: what the training begins with; None for Gaussians from the scene's points.
+    progress: how progress is written.
     page: function that returns a context manager, which serves the viewer's page; None without --view.
     """
     from clsplat.training.forecast import Forecast
@@ -109,7 +114,7 @@ def train_run(
     try:
         with (
             page(scene, run.config) if page else nullcontext() as between,
-            TrainProgress(run.config.iterations, Forecast(run.config, len(views), pixels)) as progress,
+            TrainProgress(run.config.iterations, Forecast(run.config, len(views), pixels), progress) as display,
         ):
             services.train(
                 scene,
@@ -122,7 +127,7 @@ def train_run(
                 resume=run.resuming,
                 **({} if start is None else {"start": start}),
                 on_plan=print_plan,
-                on_step=progress,
+                on_step=display,
                 between=between,
             )
     except KeyboardInterrupt as error:

@@ -32,7 +32,9 @@ from clsplat.version import package_version
 
 END_SECONDS = 60.0
 """Seconds that a command has to end by itself, with a checkpoint, before it is killed."""
-_DISK_FULL_REASONS = tuple(reason_of(OSError(number, "")) for number in (errno.ENOSPC, errno.EDQUOT))
+_DISK_FULL_REASONS = tuple(
+    text for number in (errno.ENOSPC, errno.EDQUOT) for text in (reason_of(OSError(number, "")), os.strerror(number))
+)
 _PR_SET_PDEATHSIG = 1
 
 
@@ -48,7 +50,7 @@ def run_attempt(attempt: Attempt, ended: threading.Event) -> Outcome:
                 return Outcome(attempt.name, "claimed", worker=host)
             status = _run_command(attempt, ended)
         except OSError as error:
-            reason = f"{error.filename or folder}: {reason_of(error)}"
+            reason = f"cannot go on: {error.filename or folder}: {reason_of(error)}"
             return Outcome(attempt.name, "unfit", reason=reason, worker=host)
     finally:
         claims.close()
@@ -72,9 +74,9 @@ def unfit_reason(attempt: Attempt) -> str:
 
 
 def _disk_full(log: Path) -> str:
-    """The log's last line if it says that a disk is full, else an empty string."""
+    """Why this worker cannot run tasks if the log's last line says that a disk is full, else an empty string."""
     line = last_line(log)
-    return line if any(reason in line for reason in _DISK_FULL_REASONS) else ""
+    return f"cannot go on: {line}" if any(reason in line for reason in _DISK_FULL_REASONS) else ""
 
 
 def _run_command(attempt: Attempt, ended: threading.Event) -> int:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from calls import warned
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
@@ -27,12 +29,12 @@ class GivenLoads(LoadMeasurement):
 
     def __init__(self, cameras: Any, gaussians: Any, reach: float) -> None:
         super().__init__(*cast("tuple[Any, Any, Any, Any, Any, Any]", [None] * 6))
-        self.along, self.reach, self.passes = np.asarray(gaussians, float), reach, 0
+        self.along, self.reach, self.passes, self.coarse = np.asarray(gaussians, float), reach, 0, 0
         self.__dict__["camera_places"] = on_street(cameras)
         self.__dict__["coordinates"] = on_street(gaussians)
 
     def bytes_needed(self, gaussians: float) -> int:
-        return round(10 * gaussians)
+        return round(self.coarse + 10 * gaussians)
 
     def _contributions(self, text: str) -> Iterator[Float32]:
         assert text
@@ -89,6 +91,23 @@ def test_limits_that_no_division_meets_are_refused() -> None:
     heap = GivenLoads(np.arange(0, STREET_METRES, 2), np.full(300, 50.0), 60.0)
     with pytest.raises(InputError, match=r"--block-mem 100 bytes: the largest of \d blocks? would still take"):
         divided(heap, Partition("auto", memory=100))
+    heap.device = cast(
+        "Any", SimpleNamespace(budget=100)
+    )  # the limit if none is given: then blocks are trained in pieces
+    loads, _ = warned(
+        "would still take .*but this device has 100 bytes: training will run in pieces",
+        divided,
+        heap,
+        Partition("auto"),
+    )
+    assert loads.belongs.any(axis=1).all()
+    heap.coarse = 200  # bytes of the Gaussians around a block, however small it is
+    with pytest.raises(InputError, match=r"--block-mem 100 bytes: the coarse model, .*takes 200 bytes; expected more"):
+        divided(heap, Partition("auto", memory=100))
+    loads, _ = warned(
+        "the coarse model, .*takes 200 bytes, but this device has 100 bytes", divided, heap, Partition("auto")
+    )
+    assert loads.names == ("0_0",)
 
 
 def test_a_cell_without_points_is_joined() -> None:

@@ -80,11 +80,11 @@ def test_three_tries_without_progress(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_progress_makes_tries_count_anew(tmp_path: Path) -> None:
-    """A command that does a step and fails, five times, ends well."""
-    task = counting_task(tmp_path, "a", 5, at_once=1)
+    """A command that does a step and fails, three times, ends well."""
+    task = counting_task(tmp_path, "a", 4, at_once=1)
     run_tasks([task], LocalEngine(1), tmp_path / "jobs")
-    assert counted(tmp_path, "a") == 5
-    assert (tmp_path / "jobs" / "a.log").read_text().count("--- ") == 5
+    assert counted(tmp_path, "a") == 4
+    assert (tmp_path / "jobs" / "a.log").read_text().count("--- ") == 4
 
 
 def test_a_command_that_is_not_there(tmp_path: Path) -> None:
@@ -155,7 +155,9 @@ def test_a_task_of_another_process_is_waited_for(tmp_path: Path, monkeypatch: py
 
 
 @posix
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL]
+)
 def test_the_end_of_the_dispatcher_ends_the_commands(tmp_path: Path, number: signal.Signals) -> None:
     """With Ctrl-C it waits for them; after SIGKILL they end by themselves. The same tasks then go on."""
     process = subprocess.Popen(

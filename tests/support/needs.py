@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from slurm_node import slurm_is_there
 
 SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[3] / "shared" / "scenes"))
 """Folder of the real scenes and models."""
@@ -84,6 +85,7 @@ NEEDS = {
     "rattler_build": of_extra("rattler_build", "py-rattler-build", "release"),
     "rawpy": of_extra("rawpy", "rawpy", "photos"),
     "scenes": Need("real scenes", "set CLSPLAT_SCENES to their folder", SCENES.is_dir),
+    "slurm": Need("Slurm", "apt-get install slurm-wlm munge", slurm_is_there),
     "tree_sitter_powershell": of_extra("tree_sitter_powershell", "tree-sitter-powershell", "release"),
     "torch": of_extra("torch", "PyTorch", "torch"),
     "viser": of_extra("viser", "viser", "view"),

@@ -2,11 +2,13 @@
 """Kill dispatchers, commands, workers and schedulers of jobs at random times, and compare the results.
 
     tools/stress/run job_kills -o OUT --kills 30 [--dask]
+    tools/stress/run job_kills -o OUT --kills 30 [--dask] -- SCENE --blocks 2 --iterations 600 --checkpoint-every 20
 
-The tasks count in files (tests/support/counting.py), and notice if two processes count at once. OUT must not exist.
-With --dask the tasks run on a Dask cluster of two workers, and workers and the scheduler are killed too. After each
-kill what is missing is started again by the same command. In the end all files must have the bytes of undisturbed
-tasks. The exit status is 0 if so, otherwise 1.
+Without arguments after --, the tasks count in files (tests/support/counting.py), and notice if two processes count at
+once. Otherwise these are arguments of `clsplat train`, without -o. OUT must not exist. With --dask the tasks run on a
+Dask cluster of two workers, and workers and the scheduler are killed too. After each kill, what is missing is started
+again by the same command. In the end the files must have the bytes of an undisturbed call, in OUT/whole. The exit
+status is 0 if so, otherwise 1.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -23,7 +26,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import counting
 import dispatching
 from dask_processes import DaskProcesses
 from measuring import plain_parser
@@ -34,6 +36,13 @@ STEP_SECONDS = 0.02
 """Seconds of a step."""
 STEPS_A_KILL = 60
 """Steps of all tasks together for each kill, so that work is left until the last kill."""
+CALM_SECONDS = 20.0
+"""Seconds to wait at most for progress before a kill, so that most kills hit running tasks."""
+KILL_SECONDS = 1.5
+"""Longest time from progress to a kill."""
+RESULTS = ("*.count", "merged.ply", "model.ply", "blocks/*/model.ply")
+"""Patterns of the files that are compared."""
+_ATTEMPT = re.compile(r"^--- .*, process (\d+): ", re.MULTILINE)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -43,51 +52,95 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--kills", type=int, default=30, help="number of kills, default 30")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random times, default 0")
     parser.add_argument("--dask", action="store_true", help="on a Dask cluster; otherwise on local processes")
+    parser.add_argument("train", nargs="*", help="arguments of clsplat train; without them the tasks count")
     arguments = parser.parse_args(argv)
     if arguments.output.exists():
         parser.error(f"{arguments.output}: exists, expected a new folder")
-    killed = Killed(arguments.output, arguments.kills, arguments.seed, dask=arguments.dask)
+    whole, killed = arguments.output / "whole", arguments.output / "killed"
+    for folder in (whole, killed, arguments.output / "dask"):
+        folder.mkdir(parents=True)
+    work = command(arguments.train, arguments.kills)
+    subprocess.run([*work, *place(whole, arguments.train), "--workers", str(WORKERS)], check=True)
+    cluster = DaskProcesses(arguments.output / "dask") if arguments.dask else None
+    killer = Killer([*work, *place(killed, arguments.train)], killed, random.Random(arguments.seed), cluster)
     try:
-        killed.kill_all()
-        status = killed.finish()
+        for _ in range(arguments.kills):
+            killer.kill()
+        status = killer.finish()
     finally:
-        killed.close()
-    wrong = [name for name, data in killed.wanted().items() if (arguments.output / name).read_bytes() != data]
-    twice = [path.name for path in killed.logs() if "BlockingIOError" in path.read_text()]
-    result = {"kills": killed.kills, "attempts": killed.attempts(), "status": status, "wrong": wrong, "twice": twice}
-    print(json.dumps(result, indent=2))
+        killer.close()
+    wanted, found = contents(whole), contents(killed)
+    wrong = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+    twice = [path.name for path in killer.logs() if "BlockingIOError" in path.read_text()]
+    result = {"kills": killer.kills, "attempts": killer.attempts(), "files": len(wanted), "status": status}
+    print(json.dumps({**result, "wrong": wrong, "twice": twice}, indent=2))
     return 1 if status or wrong or twice else 0
 
 
-class Killed:
-    """A dispatcher and its tasks, whose processes are killed.
+def command(train: Sequence[str], kills: int) -> list[str]:
+    """The command of the dispatcher, without its folder and engine."""
+    if train:
+        return [sys.executable, "-m", "clsplat", "train", *train]
+    steps = max(kills, 1) * STEPS_A_KILL // TASKS
+    words = ["--tasks", str(TASKS), "--steps", str(steps), "--seconds", str(STEP_SECONDS)]
+    return [sys.executable, dispatching.__file__, *words]
 
-    folder: folder of the tasks. count: number of kills.
+
+def place(folder: Path, train: Sequence[str]) -> list[str]:
+    """The arguments that name the folder of the results."""
+    return ["-o", str(folder)] if train else [str(folder)]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The bytes of the results in a folder, by name."""
+    paths = (path for pattern in RESULTS for path in folder.glob(pattern))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+class Killer:
+    """A dispatcher with workers, which are killed and started again.
+
+    words: the dispatcher's command without its engine. folder: folder of the results.
+    cluster: the Dask cluster; None for local processes.
     """
 
-    def __init__(self, folder: Path, count: int, seed: int, *, dask: bool) -> None:
-        self.folder, self.count, self.chance = folder, count, random.Random(seed)
-        self.steps = count * STEPS_A_KILL // TASKS
+    def __init__(
+        self, words: Sequence[str], folder: Path, chance: random.Random, cluster: DaskProcesses | None
+    ) -> None:
+        self.words, self.folder, self.chance, self.cluster = words, folder, chance, cluster
         self.kills: Counter[str] = Counter()
-        (folder / "dask").mkdir(parents=True)
-        self.cluster = DaskProcesses(folder / "dask") if dask else None
         self.dispatcher: subprocess.Popen[bytes] | None = None
 
-    def kill_all(self) -> None:
-        """Kill processes `count` times, and start what is missing after each kill."""
-        while self.kills.total() < self.count:
-            self._start()
-            time.sleep(self.chance.uniform(0.0, 2.5))
-            kinds = ["dispatcher", "command", "attempt", *(["worker", "scheduler"] if self.cluster else [])]
-            kind = self.chance.choice(kinds)
-            with suppress(OSError, ValueError, KeyError):  # the process has just ended
-                self._kill(kind)
-                self.kills[kind] += 1
+    def kill(self) -> None:
+        """Start what is missing, wait for progress or a random time, and kill a process with SIGKILL."""
+        self._start()
+        before, until = self._size(), time.monotonic() + self.chance.uniform(0.0, CALM_SECONDS)
+        while self._size() == before and time.monotonic() < until:
+            time.sleep(0.02)
+        time.sleep(self.chance.uniform(0.0, KILL_SECONDS))
+        kind = self.chance.choice(
+            ["dispatcher", "command", "attempt", *(["worker", "scheduler"] if self.cluster else [])]
+        )
+        pids = [pid for path in self.logs() for pid in map(int, _ATTEMPT.findall(path.read_text())) if is_attempt(pid)]
+        if not pids and kind in ("command", "attempt"):
+            kind = "dispatcher"
+        with suppress(OSError, IndexError):  # the process has just ended
+            if kind == "dispatcher":
+                assert self.dispatcher is not None
+                self.dispatcher.kill()
+                self.dispatcher.wait()
+            elif kind in ("worker", "scheduler"):
+                assert self.cluster is not None
+                self.cluster.kill(self.chance.choice("ab") if kind == "worker" else "scheduler")
+            else:
+                pid = self.chance.choice(pids)
+                os.kill(pid if kind == "attempt" else children(pid)[0], signal.SIGKILL)
+            self.kills[kind] += 1
 
     def finish(self) -> int:
         """Let the tasks end. Returns the dispatcher's exit status."""
         status = 1
-        for _ in range(5):  # three tries without progress may have ended the running dispatcher
+        for _ in range(5):  # three tries without progress, all killed, may have ended the running dispatcher
             self._start()
             assert self.dispatcher is not None
             status = self.dispatcher.wait(600)
@@ -95,18 +148,13 @@ class Killed:
                 break
         return status
 
-    def wanted(self) -> dict[str, bytes]:
-        """The files of undisturbed tasks, by name."""
-        names = {**{str(number): self.steps for number in range(TASKS)}, "sum": dispatching.SUM_STEPS}
-        return {f"{name}.count": b"".join(b"%d\n" % step for step in range(steps)) for name, steps in names.items()}
-
     def logs(self) -> list[Path]:
         """The tasks' logs."""
         return sorted((self.folder / "jobs").glob("*.log"))
 
     def attempts(self) -> int:
         """Number of attempts that have begun."""
-        return sum(path.read_text().count("--- ") for path in self.logs())
+        return sum(len(_ATTEMPT.findall(path.read_text())) for path in self.logs())
 
     def close(self) -> None:
         """Kill everything that is left."""
@@ -115,6 +163,11 @@ class Killed:
             self.dispatcher.wait()
         if self.cluster is not None:
             self.cluster.close()
+
+    def _size(self) -> int:
+        """Number of bytes of the files that grow with each step."""
+        paths = [*self.folder.glob("*.count"), *self.folder.rglob("metrics.jsonl")]
+        return sum(path.stat().st_size for path in paths)
 
     def _start(self) -> None:
         """Start the scheduler, the workers and the dispatcher, if they do not run."""
@@ -127,27 +180,23 @@ class Killed:
                 if not self.cluster.runs(name):
                     self.cluster.start_worker(name)
         if self.dispatcher is None or self.dispatcher.poll() is not None:
-            words = [*words, "--tasks", str(TASKS), "--steps", str(self.steps), "--seconds", str(STEP_SECONDS)]
-            command = [sys.executable, dispatching.__file__, str(self.folder), *words]
-            self.dispatcher = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    def _kill(self, kind: str) -> None:
-        """Kill a process of this kind with SIGKILL. Raises OSError, ValueError or KeyError if there is none."""
-        if kind == "dispatcher":
-            assert self.dispatcher is not None
-            os.kill(self.dispatcher.pid, signal.SIGKILL)
-            self.dispatcher.wait()
-        elif kind in ("worker", "scheduler"):
-            assert self.cluster is not None
-            self.cluster.kill(self.chance.choice("ab") if kind == "worker" else "scheduler")
-        else:
-            names = [str(number) for number in range(TASKS) if not (self.folder / f"{number}.done").exists()]
-            pid = int((self.folder / f"{self.chance.choice([*names, 'sum'])}.pid").read_text())
-            if f"{counting.__name__}.py".encode() not in Path(f"/proc/{pid}/cmdline").read_bytes():
-                raise ValueError(f"{pid}: another process")
-            os.kill(pid if kind == "command" else parent(pid), signal.SIGKILL)
+            with (self.folder.parent / "dispatcher.txt").open("ab") as log:
+                self.dispatcher = subprocess.Popen([*self.words, *words], stdout=log, stderr=log)
 
 
-def parent(pid: int) -> int:
-    """Process id of the parent of a process. Raises OSError."""
-    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+def is_attempt(pid: int) -> bool:
+    """True if a process with this id runs an attempt."""
+    try:
+        return b"clsplat.jobs.attempt" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def children(pid: int) -> list[int]:
+    """Process ids of the children of a process."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError, ValueError, IndexError):
+            if int(path.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(path.parent.name))
+    return found

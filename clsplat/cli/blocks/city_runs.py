@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from clsplat.cli.eval import print_summary
 from clsplat.cli.session import Services, load_scene
-from clsplat.cli.training_run import TrainingMachine, tell_of_training, train_run
+from clsplat.cli.training_run import TrainingMachine, TrainingProgress, tell_of_training, train_run
 
 if TYPE_CHECKING:
     from clsplat.blocks.block_training import LoadScene, TrainRun
@@ -29,8 +29,11 @@ def loader(services: Services) -> LoadScene:
     return lambda config, source, frame: load_scene(services, source, config, frame=frame)
 
 
-def trainer(services: Services, machine: TrainingMachine) -> TrainRun:
-    """Return a function that trains a run on this machine, with a progress bar. Raises DeviceError."""
+def trainer(services: Services, machine: TrainingMachine, progress: TrainingProgress = "auto") -> TrainRun:
+    """Return a function that trains a run on this machine. Raises DeviceError.
+
+    progress: how progress is written (`TrainProgress`).
+    """
     from clsplat.selftest.result import stages_of_training
 
     opened = machine.open_all(services)
@@ -39,7 +42,7 @@ def trainer(services: Services, machine: TrainingMachine) -> TrainRun:
         devices = [services.require(device, stages_of_training(run.config)) for device in opened]
         run.resume_command = shlex.join([*shlex.split(run.resume_command), *machine.flags])
         tell_of_training(scene, run.config, devices)
-        train_run(services, scene, run, devices, machine, start=start)
+        train_run(services, scene, run, devices, machine, start=start, progress=progress)
         print(f"model in {run.model_path}", file=sys.stderr)
 
     return train

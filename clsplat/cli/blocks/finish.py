@@ -12,7 +12,7 @@ from tyro.conf import arg
 from clsplat.cli.blocks.city_runs import CityFolder, loader, tell_of_city, trainer
 from clsplat.cli.options import Flag, OptionalInt, Verb
 from clsplat.cli.session import Services
-from clsplat.cli.training_run import TrainingMachine
+from clsplat.cli.training_run import TrainingMachine, TrainingProgress
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,8 @@ class BlocksFinishVerb(Verb):
     """Folder with the merged model (clsplat blocks merge)."""
     finish: OptionalInt = None
     """Number of steps. If not given: those of the run that goes on, else those of the plan."""
+    progress: TrainingProgress = "auto"
+    """How progress is written, as for clsplat blocks train."""
     device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
     json: Flag = False
     """Print the evaluation as JSON on standard output."""
@@ -36,7 +38,7 @@ def run(verb: BlocksFinishVerb, services: Services) -> int:
     from clsplat.blocks.block_training import finish
 
     verb.device.check()
-    train = trainer(services, verb.device)
+    train = trainer(services, verb.device, verb.progress)
     if not finish(verb.city, verb.finish, loader(services), train, verb.device.count):
         print(f"{verb.city}: has been finished before", file=sys.stderr)
     tell_of_city(verb.city, as_json=verb.json)

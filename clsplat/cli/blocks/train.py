@@ -12,7 +12,7 @@ from tyro.conf import arg
 from clsplat.cli.blocks.city_runs import CityFolder, loader, trainer
 from clsplat.cli.options import Verb
 from clsplat.cli.session import Services
-from clsplat.cli.training_run import TrainingMachine
+from clsplat.cli.training_run import TrainingMachine, TrainingProgress
 
 
 @dataclass(frozen=True)
@@ -25,17 +25,29 @@ class BlocksTrainVerb(Verb):
 
     city: CityFolder
     """Folder with the plan (clsplat blocks plan)."""
-    block: Annotated[str, arg(metavar="I,J")]
-    """Name of the block, as in the plan."""
+    block: Annotated[str, arg(metavar="I,J|K")]
+    """Name of the block, as in the plan, or its number in the order of the plan, from 0 on. A number for which there is
+    no block is no error, so that an array of jobs may have more jobs than there are blocks."""
+    progress: TrainingProgress = "auto"
+    """How progress is written. auto: a bar on standard error if that is a terminal, else lines of text. openjd: lines
+    of Open Job Description on standard output."""
     device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
 
 
 def run(verb: BlocksTrainVerb, services: Services) -> int:
     """Train the block, unless it has finished."""
     from clsplat.blocks.block_training import train_block
+    from clsplat.blocks.plan import read_plan
 
     verb.device.check()
-    train = trainer(services, verb.device)
-    if not train_block(verb.city, verb.block, loader(services), train, verb.device.count):
-        print(f"{verb.city}: block {verb.block} has finished before", file=sys.stderr)
+    name = verb.block
+    if name.isascii() and name.isdigit():
+        blocks = read_plan(verb.city).blocks
+        if int(name) >= len(blocks):
+            print(f"{verb.city}: the plan has {len(blocks)} blocks, so there is nothing to do", file=sys.stderr)
+            return 0
+        name = blocks[int(name)].name.replace("_", ",")
+    train = trainer(services, verb.device, verb.progress)
+    if not train_block(verb.city, name, loader(services), train, verb.device.count):
+        print(f"{verb.city}: block {name} has finished before", file=sys.stderr)
     return 0
