@@ -3,29 +3,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from math import sqrt
 
 from clsplat.blocks.plan import Block, BlockPlan
 from clsplat.config.depth import DEPTH_WEIGHT_END_FRACTION
-from clsplat.config.training import TrainConfig
+from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.training.learning_rates import means_rate_at
 
-FINISH_APPEARANCE_RATE = 0.1
+FINISH_APPEARANCE_RATE = 0.03
 """Learning rate of appearance in the finish, as a fraction of the setting. The finish begins with appearances that
 need small corrections only."""
 FINISH_COOLDOWN_TO = 0.1
 """Fraction of every learning rate that is left at the end of the finish."""
 
 
-def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, gaussians: int) -> TrainConfig:
+def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainConfig:
     """Return the settings of a block's training: what remains of the whole's schedule after the coarse model's steps.
 
     coarse: settings of the coarse model.
-    gaussians: number of Gaussians of the coarse model.
 
-    Numbers of steps are scaled like the number of steps, so that a densification sees the same fraction of the
-    photographs as in a training of the whole. The SH degree is full from the start, photographs have their full size,
-    and opacities are not reset, since the Gaussians have been trained already.
+    Steps of the schedule are scaled by the block's fraction of the photographs, so that a densification sees the same
+    fraction of them as in a training of the whole. The SH degree is full from the start, photographs have their full
+    size, and opacities are not reset, since the Gaussians have been trained already.
     """
     whole, density, optimiser = plan.settings, plan.settings.density, plan.settings.optimiser
     passed = coarse.iterations
@@ -37,16 +37,16 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, gaussians
     def scaled(steps: int) -> int:
         return max(round(steps * scale), 1) if steps else 0
 
-    inside = block.gaussians / max(gaussians, 1)
+    frozen = plan.gaussians - block.gaussians
+    inside = max(round(block.gaussians / plan.gaussians * density.max_gaussians), block.gaussians)
     return replace(
-        _without_events(whole, photographs=photographs_of(plan)),
+        _without_events(whole, photographs=plan.photographs),
         iterations=block.iterations,
         eval_at=(),
         report=False,
         depth_weight=whole.depth_weight * DEPTH_WEIGHT_END_FRACTION ** (passed / whole.iterations),
         optimiser=replace(
-            optimiser,
-            means_rate=means_rate_at(whole, passed),
+            _for_fewer_photographs(optimiser, plan.photographs / len(block.photographs)),
             means_rate_steps=max(left(optimiser.means_rate_steps), 1),
             cooldown=scaled(optimiser.cooldown),
         ),
@@ -57,7 +57,7 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, gaussians
             stop=left(density.stop),
             opacity_reset_every=0,
             prune_every=scaled(density.prune_every),
-            max_gaussians=gaussians - block.gaussians + max(round(inside * density.max_gaussians), block.gaussians),
+            max_gaussians=frozen + inside,
         ),
     )
 
@@ -69,7 +69,7 @@ def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
     """
     whole = plan.settings
     return replace(
-        _without_events(whole, photographs=photographs_of(plan)),
+        _without_events(whole, photographs=plan.photographs),
         iterations=steps,
         eval_at=tuple(step for step in whole.eval_at if step <= steps),
         appearance_rate=whole.appearance_rate * FINISH_APPEARANCE_RATE,
@@ -85,9 +85,21 @@ def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
     )
 
 
-def photographs_of(plan: BlockPlan) -> int:
-    """Number of photographs that belong to a block."""
-    return len({name for block in plan.blocks for name in block.photographs})
+def _for_fewer_photographs(optimiser: OptimiserConfig, times: float) -> OptimiserConfig:
+    """Return Adam's settings for a block, of whose photographs more show a Gaussian than of those of the whole.
+
+    times: number of the scene's photographs, as a multiple of the block's.
+
+    In a training of the whole, a Gaussian has zero gradients in all steps that do not show it. They make Adam's second
+    moment smaller by `times`, and so the change by a view that shows the Gaussian larger by the root. A block has few
+    such steps, so its learning rates are multiplied by the root, and moments decay as much per pass. Sparse Adam
+    leaves out such steps everywhere.
+    """
+    if optimiser.sparse:
+        return optimiser
+    rates = [field.name for field in fields(optimiser) if field.name.endswith(("_rate", "_rate_end"))]
+    changes = {name: getattr(optimiser, name) * sqrt(times) for name in rates}
+    return replace(optimiser, **changes, beta1=optimiser.beta1**times, beta2=optimiser.beta2**times)
 
 
 def _without_events(whole: TrainConfig, *, photographs: int) -> TrainConfig:

@@ -55,7 +55,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene, photographs=block.photographs)
         model = Gaussians.load(coarse.model_path)
-        config = block_settings(plan, block, coarse.config, len(model)).on_devices(devices, explicit=False)
+        config = block_settings(plan, block, coarse.config).on_devices(devices, explicit=False)
         run = Run.create(folder, config, scene=plan.scene, resume=is_run(folder), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "train", str(city), "--block", name])
         start = Start(model, region_of(plan, block.widened), _with_appearance(coarse))

@@ -22,6 +22,8 @@ from clsplat.training.preparation import prepared
 
 OF_NO_MODEL = frozenset({"checkpoint_every", "eval_at", "stages_every", "report"})
 """Settings that do not change the model. They may differ from the plan's."""
+SAME_UP_RADIANS = 1e-4
+"""Angle up to which two up directions count as equal, as machines round estimates differently."""
 
 
 def check_plan(
@@ -74,13 +76,15 @@ def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Partition
         return None
     plan = check_plan(city, scene, config)
     now = ground_of(scene, up).up
+    if max(abs(a - b) for a, b in zip(plan.up, now, strict=True)) < SAME_UP_RADIANS:
+        now = plan.up
     changed = [
         f"{flag} is {was} in the plan and {given} now"
         for flag, was, given in (
             ("--blocks", plan.division.blocks, division.blocks),
             ("--block-mem", plan.division.memory, division.memory),
             ("--block-photographs", plan.division.photographs, division.photographs),
-            ("--up", plan.up, now),
+            ("--up", *(",".join(f"{value:.6g}" for value in way) for way in (plan.up, now))),
         )
         if was != given
     ]

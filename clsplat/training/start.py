@@ -15,7 +15,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.optimisation.trained_region import TrainedRegion
-from clsplat.runs.checkpoints import Checkpoint, unusable
+from clsplat.runs.checkpoints import Checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +94,8 @@ def check_region(checkpoint: Checkpoint, region: TrainedRegion | None) -> None:
     """Raise InputError if a checkpoint was written with another region than `region`."""
     saved, now = checkpoint.state.get("region"), region_state(region).get("region")
     if saved != now:
-        raise unusable(
-            checkpoint,
-            f"it was written with the region {saved or 'of the whole scene'}, and now the region is "
-            f"{now or 'the whole scene'}: continue with the command that began the training",
+        of, this = ("the whole scene" if each is None else f"the region {each}" for each in (saved, now))
+        raise InputError(
+            f"checkpoint of step {checkpoint.step}: was written by a training of {of}, and this training is of {this}; "
+            "continue with the command that began the training"
         )

@@ -144,7 +144,11 @@ def test_a_plan_with_other_options_is_made_anew_until_blocks_are_trained(city: P
     scene, plan = load_scene_of(WHOLE, small_scene), read_plan(city)
     assert kept_plan(city, scene, WHOLE, plan.division, plan.up) == plan
     assert kept_plan(city, scene, WHOLE, Partition("3"), plan.up) is None
+    assert kept_plan(city, scene, WHOLE, plan.division, (0.0, -1.0, 1e-5)) == plan
+    assert kept_plan(city, scene, WHOLE, plan.division, (0.0, 0.0, 1.0)) is None
     (city / "blocks" / "0_0").mkdir(parents=True)
     with pytest.raises(InputError, match=r"--blocks is 2 in the plan and 3 now.*expected the same"):
         kept_plan(city, scene, WHOLE, Partition("3"), plan.up)
+    with pytest.raises(InputError, match="--up is 0,-1,0 in the plan and 0,0,1 now"):
+        kept_plan(city, scene, WHOLE, plan.division, (0.0, 0.0, 2.0))
     assert kept_plan(city, scene, WHOLE, plan.division, plan.up) == plan

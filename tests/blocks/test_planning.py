@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from calls import warned
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
@@ -89,6 +91,13 @@ def test_limits_that_no_division_meets_are_refused() -> None:
     heap = GivenLoads(np.arange(0, STREET_METRES, 2), np.full(300, 50.0), 60.0)
     with pytest.raises(InputError, match=r"--block-mem 100 bytes: the largest of \d blocks? would still take"):
         divided(heap, Partition("auto", memory=100))
+    heap.device = cast(
+        "Any", SimpleNamespace(budget=100)
+    )  # the limit if none is given: then blocks are trained in pieces
+    loads, _ = warned(
+        "would still take .*but this device has 100 bytes: it will be slow", divided, heap, Partition("auto")
+    )
+    assert loads.belongs.any(axis=1).all()
 
 
 def test_a_cell_without_points_is_joined() -> None:

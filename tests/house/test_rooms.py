@@ -76,7 +76,10 @@ def test_a_planted_import_is_found(copy: Path, module: str, line: str, told: str
     assert told in " ".join(done.stdout.split())
 
 
-LATE = {"clsplat.gaussians": {"clsplat.models.formats"}}  # Gaussians.load and save
+LATE = {
+    "clsplat.gaussians": {"clsplat.models.formats"},  # Gaussians.load and save
+    "clsplat.cli.train": {"clsplat.cli.blocks.whole"},  # train --blocks, whose plan trains a coarse model by train
+}
 """Imports that a function makes on purpose, against the order of the modules."""
 
 

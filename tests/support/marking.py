@@ -39,13 +39,16 @@ class TwinMarker:
         zeros = {name: np.zeros(count, np.float32) for name in ("gradient_sums", "seen", "radii")}
         return {**zeros, **self.statistics}
 
+    def _means(self) -> NDArray[np.float32]:
+        return self.parameters.get("means", np.zeros((len(self.parameters["opacity_logits"]), 3), np.float32))
+
     def scores(self, rules: MarkRules) -> NDArray[np.float32]:
-        return twin.scores(rules, self._known())
+        return twin.scores(rules, self._known(), self._means())
 
     def rows(self, rules: MarkRules) -> TwinRows:
         logits = self.parameters["opacity_logits"]
         log_scales = self.parameters.get("log_scales", np.zeros((len(logits), 3), np.float32))
-        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits))
+        return TwinRows(*twin.rows(rules, self._known(), self._means(), log_scales, logits))
 
 
 def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:

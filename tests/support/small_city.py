@@ -36,6 +36,7 @@ def write_city(city: Path, scene: Path, device: Device, config: TrainConfig = WH
     train(load_scene_of(half, scene), half, run=run, device=device)
     record = scene_record.read(run)
     assert record is not None
+    whole, coarse = load_scene_of(config, scene), Gaussians.load(run.model_path)
     plan = BlockPlan(
         scene=scene.absolute(),
         settings=config,
@@ -47,7 +48,9 @@ def write_city(city: Path, scene: Path, device: Device, config: TrainConfig = WH
         coarse=digest(run.model_path),
         scene_digest=scene_record.digest_of(record),
         finish_steps=FINISH_STEPS,
-        blocks=blocks_of(load_scene_of(config, scene), Gaussians.load(run.model_path)),
+        blocks=blocks_of(whole, coarse),
+        photographs=len(whole.train_views),
+        gaussians=len(coarse),
     )
     write_plan(city, plan)
     return plan

@@ -109,6 +109,18 @@ def test_an_experiment_makes_its_table(
         "exposure": ["--appearance", "ppisp", "--mixes", "0.1"],
         "poses": ["--width", "40"],
         "towns": ["--towns", "1x1", "--scaled", "1x1", "--town-photos", "9", "--town-size", "32x20", "--own-block"],
+        "blocks": [
+            "--town",
+            "1x1",
+            "--town-photos",
+            "16",
+            "--town-size",
+            "64x40",
+            "--blocks",
+            "2",
+            "--gaussians",
+            "900",
+        ],
     }
     words = [name, str(tmp_path / "out"), *scenes, "--iterations", "2", *more.get(name, ())]
     status = main(words)

@@ -101,11 +101,12 @@ class LoadMeasurement:
     def bytes_needed(self, gaussians: float) -> int:
         """Bytes of device memory that the training of a block takes, if all of it is on the device at once.
 
-        gaussians: number of the coarse model's Gaussians in the block's widened cell.
+        gaussians: number of the coarse model's Gaussians in the block's widened cell. They grow in number. The other
+            Gaussians of the coarse model stay as they are, but take memory too.
         """
-        density = self.config.density
+        density, frozen = self.config.density, len(self.model) - round(gaussians)
         most = max(round(gaussians / max(len(self.model), 1) * density.max_gaussians), 1)
-        rows = most if density.fills else min(max(round(ROWS_GROWTH * gaussians), 1), most)
+        rows = frozen + (most if density.fills else min(max(round(ROWS_GROWTH * gaussians), 1), most))
         need = step_need(
             self.device,
             rows,

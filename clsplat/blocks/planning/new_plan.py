@@ -23,7 +23,7 @@ from clsplat.blocks.planning.split import (
     without,
 )
 from clsplat.camera import Camera
-from clsplat.errors import InputError, amount, examples
+from clsplat.errors import InputError, amount, examples, warn
 from clsplat.files.documents import known_digest
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run, is_run
@@ -94,17 +94,17 @@ def divided(measurement: LoadMeasurement, division: Partition) -> tuple[CellLoad
     elif asked is not None:
         tree = balanced(measurement.places, asked)
     else:
-        tree = _within(measurement, division.memory or measurement.device.budget, division.photographs)
+        tree = _within(measurement, division)
     return _joined(measurement, tree)
 
 
-def _within(measurement: LoadMeasurement, memory: int, most: int | None) -> Tree:
-    """Cut each block that is over a limit in two, until none is.
+def _within(measurement: LoadMeasurement, division: Partition) -> Tree:
+    """Cut each block that is over a limit of `division` in two, until none is.
 
-    memory: largest number of bytes of device memory of a block.
-    most: largest number of photographs of a block; None for no limit.
-    Raises InputError if smaller cells do not help.
+    Raises InputError if smaller cells do not help. For the memory of this device, which is the limit if no other is
+    given, there is only a warning, as a training of more runs in pieces.
     """
+    memory, most = division.memory or measurement.device.budget, division.photographs
     places = measurement.places
     tree, before = balanced(places, min(ceil(len(places) / (most or len(places))), MAX_BLOCKS)), inf
     while True:
@@ -118,15 +118,19 @@ def _within(measurement: LoadMeasurement, memory: int, most: int | None) -> Tree
         over = [name for name, part in zip(loads.names, parts, strict=True) if part > 1]
         finer = cut_again(tree, over, places)
         if finer == tree or largest > MIN_LOAD_DROP * before or len(list(cells(finer))) > MAX_BLOCKS:
-            if max(taken) / memory == largest:
+            if max(taken) / memory < largest:
                 raise InputError(
-                    f"--block-mem {amount(memory)}: the largest of {len(parts):,} blocks would still take "
-                    f"{amount(max(taken))}, and smaller blocks hardly less; expected at least that, or a smaller "
-                    "--resolution"
+                    f"--block-photographs {most}: the largest of {len(parts):,} blocks would still have "
+                    f"{max(counts):,} photographs, and smaller blocks hardly fewer, as each photograph shows several; "
+                    "expected at least that"
                 )
+            takes = f"the largest of {len(parts):,} blocks would still take {amount(max(taken))}"
+            if division.memory is None:
+                warn(f"{takes}, and smaller blocks hardly less, but this device has {amount(memory)}: it will be slow")
+                return tree
             raise InputError(
-                f"--block-photographs {most}: the largest of {len(parts):,} blocks would still have {max(counts):,} "
-                "photographs, and smaller blocks hardly fewer, as each photograph shows several; expected at least that"
+                f"--block-mem {amount(memory)}: {takes}, and smaller blocks hardly less; expected at least that, or a "
+                "smaller --resolution"
             )
         tree, before = finer, largest
 

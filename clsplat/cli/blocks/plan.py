@@ -101,10 +101,10 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     if plan is None:
         try:
             coarse = _trained(verb, services, coarse, scene, config)
+            plan = _made(verb, services, coarse, scene, config, (division, up))
         except KeyboardInterrupt as error:
             error.args = (f"before the plan in {city} was made; the same command goes on",)
             raise
-        plan = _made(verb, services, coarse, scene, config, (division, up))
     for line in plan.joined:
         warn(f"{city / PLAN_FILE}: {line}")
     _tell(city, plan)

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.random import Generator
 
 from clsplat.config.training import OptimiserConfig
-from clsplat.device.buffers import Workspace, allocate, upload
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import SlotFields
 from clsplat.optimisation.step_noise import Exploration
 from clsplat.optimisation.trained_region import TrainedRegion
-from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.steps import ADAM_RATES, random_scene
 from clsplat.selftest.harness import CaseBench
 from clsplat.selftest.scenes import evenly
@@ -27,6 +27,9 @@ from clsplat.stages.project import Screen, Slots, project, project_grad, project
 from clsplat.stages.sampling import sampling_limits
 
 FIELDS = SlotFields(contributions=True)
+NOISE = Exploration(amount=1e3, dead=1.0, key=(3, 5))
+ON_SCREEN = ("screen", "contributions", "screen of step")
+"""Results that kernels write for visible Gaussians only."""
 NO_LIMIT = np.float32(-1e30)
 """Lower limit of the log scales of a Gaussian that has no limit."""
 
@@ -67,39 +70,45 @@ def _frozen(bench: CaseBench) -> list[Inputs]:
     ]
 
 
+def _results(device: Device, work: Workspace, given: Inputs, region: TrainedRegion | None) -> dict[str, DeviceArray]:
+    """Launch every kernel that knows of regions, but for density_scores. Returns the results by name."""
+    model, camera_array = upload_gaussians(device, given.gaussians), upload(device, pack_camera(given.camera))
+    projected = project(device, work, model, given.camera, camera_array)
+    count, coefficients = model.count, model.coefficients
+    unwritten = [np.full(shape, np.nan, np.float32) for shape in ((count, 2), (count,), (count, 2), (count,))]
+    on_screen, contributions, on_screen_of_step, further = (upload(device, array) for array in unwritten)
+    view = (camera_array, projected, Slots(upload(device, given.slots), None, FIELDS))
+
+    gradients = allocate_gaussians(device, count, coefficients, zero=True)
+    screen = Screen(on_screen, contributions)
+    project_grad(device, model, *view, gradients, screen, explore=given.explore, region=region)
+
+    stepped = upload_gaussians(device, given.gaussians)
+    moments = (allocate_gaussians(device, count, coefficients, zero=True) for _ in range(2))
+    step = AdamStep(OptimiserConfig(sparse=given.sparse), 1, ADAM_RATES)
+    target = (Screen(on_screen_of_step, further), fresh_readback(device))
+    project_step(device, step, (stepped, *moments), *view, *target, explore=given.explore, region=region)
+
+    limits, moved = allocate(device, (count,), np.float32), upload_gaussians(device, given.gaussians)
+    sampling_limits(device, work, model, upload_cameras(device, [given.camera]), limits, region)
+    noise(device, NOISE, moved, 0, fresh_readback(device), region)
+    return {
+        **{f"gradients of {group}": gradients[group] for group in PARAMETER_GROUPS},
+        **{f"new {group}": stepped[group] for group in PARAMETER_GROUPS},
+        "screen": on_screen,
+        "contributions": contributions,
+        "screen of step": on_screen_of_step,
+        "limits": limits,
+        "moved means": moved["means"],
+        "counts": projected.tile_counts,
+    }
+
+
 def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Run the kernels with a region and without one."""
-    camera_array, cameras = upload(device, pack_camera(given.camera)), upload_cameras(device, [given.camera])
-    reads: dict[str, Read] = {}
-    for name, region in (("", None), ("in region ", given.region)):
-        model = upload_gaussians(device, given.gaussians)
-        projected = project(device, work, model, given.camera, camera_array)
-        count, coefficients = model.count, model.coefficients
-        nan = np.full(3 * count, np.nan, np.float32)
-        screen = Screen(upload(device, nan[: 2 * count].reshape(-1, 2)), upload(device, nan[:count]))
-        view = (camera_array, projected, Slots(upload(device, given.slots), None, FIELDS))
-        gradients = allocate_gaussians(device, count, coefficients, zero=True)
-        project_grad(device, model, *view, gradients, screen, explore=given.explore, region=region)
-        least = allocate(device, (count,), np.float32)
-        sampling_limits(device, work, model, cameras, least, region)
-        shaken = upload_gaussians(device, given.gaussians)
-        noise(device, Exploration(amount=1e3, dead=1.0, key=(3, 5)), shaken, 0, fresh_readback(device), region)
-        moments = [allocate_gaussians(device, count, coefficients, zero=True) for _ in range(2)]
-        step = AdamStep(OptimiserConfig(sparse=given.sparse), 1, ADAM_RATES)
-        stepped = Screen(upload(device, nan[: 2 * count].reshape(-1, 2)), upload(device, nan[:count]))
-        moved = (upload_gaussians(device, given.gaussians), *moments)
-        readback = fresh_readback(device)
-        project_step(device, step, moved, *view, stepped, readback, explore=given.explore, region=region)
-        arrays = {f"gradients of {group}": gradients[group] for group in PARAMETER_GROUPS}
-        arrays |= {f"new {group}": moved[0][group] for group in PARAMETER_GROUPS}
-        arrays |= {
-            "screen": screen.gradients,
-            "contributions": screen.contributions,
-            "screen of step": stepped.gradients,
-        }
-        arrays |= {"limits": least, "moved means": shaken["means"], "counts": projected.tile_counts}
-        reads |= {f"{name}{key}": array for key, array in arrays.items()}
-    return lambda: {name: array.get() for name, array in reads.items()}
+    """Run the kernels without a region and with one."""
+    results = _results(device, work, given, None)
+    inside = _results(device, work, given, given.region)
+    return read_of(**results, **{f"in region {name}": array for name, array in inside.items()})
 
 
 def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
@@ -115,9 +124,10 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
         array = got[name]
         outside = before[name] if name in before else np.full_like(array, NO_LIMIT if name == "limits" else 0)
         values = np.where(inside.reshape(-1, *[1] * (array.ndim - 1)), array, outside)
-        seen = shown if name in ("screen", "contributions", "screen of step") else np.ones_like(shown)
-        got[f"in region {name}"] = np.where(np.isnan(both := got[f"in region {name}"]), 0, both)[seen]
-        wanted[f"in region {name}"] = exactly(np.where(np.isnan(values), 0, values)[seen])
+        written = shown if name in ON_SCREEN else np.ones_like(shown)
+        # NaN means are equal to themselves here
+        found, values = (np.where(np.isnan(each), 0, each)[written] for each in (got[f"in region {name}"], values))
+        got[f"in region {name}"], wanted[f"in region {name}"] = found, exactly(values)
     return wanted
 
 

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What blocks and finish take from the coarse model: appearance and refined cameras, and none of them trained."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_city import WHOLE, load, trains_on, write_city
+
+from clsplat.blocks.block_training import finish, train_block
+from clsplat.blocks.merging import merge
+from clsplat.device.context import Device
+from clsplat.runs.refined_lenses import through_refined
+from clsplat.runs.run import Run
+from clsplat.runs.scene_record import read
+from clsplat.scenes.loading import load_scene_of
+from clsplat.scenes.readers.colmap import read_cameras
+
+SETTINGS = replace(
+    WHOLE,
+    appearance="exposure",
+    refine_poses=True,
+    refine_lenses=True,
+    refine_gate=0.0,
+    density=replace(WHOLE.density, every=0),
+)
+
+
+@pytest.fixture(scope="module")
+def refined(tmp_path_factory: pytest.TempPathFactory, small_scene: Path, default_device: Device) -> Path:
+    """A city whose coarse model has refined cameras and learnt exposures."""
+    city = tmp_path_factory.mktemp("refined") / "city"
+    write_city(city, small_scene, default_device, SETTINGS)
+    for name in ("0,0", "1,0"):
+        assert train_block(city, name, load(), trains_on(default_device))
+    assert merge(city)
+    assert finish(city, None, load(), trains_on(default_device))
+    return city
+
+
+def gains(run: Path) -> dict[str, object]:
+    photographs: dict[str, object] = json.loads((run / "appearance.json").read_text())["photographs"]
+    return photographs
+
+
+def test_blocks_have_the_coarse_models_appearance(refined: Path) -> None:
+    coarse = gains(refined / "coarse")
+    assert any(np.abs(np.array(row["log2_gains"])).max() > 1e-3 for row in coarse.values())  # type: ignore[index]
+    for name in ("0_0", "1_0"):
+        block = gains(refined / "blocks" / name)
+        assert len(block) == 7
+        assert block == {photograph: coarse[photograph] for photograph in block}
+
+
+def test_the_finish_goes_on_with_the_appearance(refined: Path) -> None:
+    coarse, last = gains(refined / "coarse"), gains(refined)
+    assert coarse.keys() == last.keys()
+    assert coarse != last
+    change = [np.subtract(last[name]["log2_gains"], coarse[name]["log2_gains"]) for name in last]  # type: ignore[index]
+    assert np.abs(change).max() < 0.12, "six steps from there, not from the start"
+
+
+def test_blocks_and_finish_have_the_refined_cameras(refined: Path, small_scene: Path) -> None:
+    cameras = read_cameras(refined / "coarse" / "refined")
+    given = {view.name: view.camera for view in load_scene_of(SETTINGS, small_scene).views}
+    for folder in ("blocks/0_0", "blocks/1_0", "."):
+        run = Run.open(refined / folder)
+        record = read(run)
+        assert record is not None
+        assert not run.config.refines
+        for name, view in record["views"].items():
+            camera = cameras[name] if view["split"] == "train" else given[name]
+            # as text and back, with 17 digits
+            np.testing.assert_allclose(view["pose"], [*camera.rotation.ravel(), *camera.translation], atol=1e-12)
+            assert view["lens"][0] == pytest.approx(cameras[name].fx, rel=1e-12)
+    moved = [np.abs(cameras[name].translation - camera.translation).max() for name, camera in given.items()]
+    assert max(moved) > 1e-4
+
+
+def test_the_evaluation_of_the_city_sees_through_the_refined_lenses(refined: Path, small_scene: Path) -> None:
+    views = load_scene_of(SETTINGS, small_scene).test_views
+    cameras = read_cameras(refined / "coarse" / "refined")
+    for view in through_refined(views, Run.open(refined)):
+        assert view.camera.fx == pytest.approx(cameras[view.name].fx, rel=1e-12)
+        assert view.camera.fx != views[0].camera.fx
+
+
+def test_a_city_without_the_learnt_appearance_is_refused(refined: Path, tmp_path: Path, default_device: Device) -> None:
+    from calls import refusal
+
+    city = shutil.copytree(refined, tmp_path / "city")
+    (city / "coarse" / "appearance.json").unlink()
+    (city / "blocks" / "0_0" / "done.json").unlink()
+    said = refusal(lambda: train_block(city, "0,0", load(), trains_on(default_device)))
+    assert (
+        "coarse/appearance.json: no such file, expected a finished run of clsplat train --appearance exposure" in said
+    )
