@@ -156,8 +156,8 @@ class DaskEngine:
         self._looked_at = now
         if self._workers and not self._sent and self._left_out.issuperset(self._workers):
             raise ClsplatError(
-                f"--scheduler {self._scheduler}: all {len(self._workers)} workers are left out; the same command goes on "
-                "when they can run tasks, or others have come"
+                f"--scheduler {self._scheduler}: has no workers but those that are left out; the same command goes on "
+                "with others, or when that is mended"
             )
 
     def _outcome(self, sent: _Sent) -> Outcome:
