@@ -14,7 +14,7 @@ from clsplat.training.learning_rates import means_rate_at
 FINISH_APPEARANCE_RATE = 0.03
 """Learning rate of appearance in the finish, as a fraction of the setting. The finish begins with appearances that
 need small corrections only."""
-FINISH_COOLDOWN_TO = 0.1
+FINISH_COOLDOWN_TO = 0.2
 """Fraction of every learning rate that is left at the end of the finish."""
 
 

@@ -29,12 +29,12 @@ class GivenLoads(LoadMeasurement):
 
     def __init__(self, cameras: Any, gaussians: Any, reach: float) -> None:
         super().__init__(*cast("tuple[Any, Any, Any, Any, Any, Any]", [None] * 6))
-        self.along, self.reach, self.passes = np.asarray(gaussians, float), reach, 0
+        self.along, self.reach, self.passes, self.coarse = np.asarray(gaussians, float), reach, 0, 0
         self.__dict__["camera_places"] = on_street(cameras)
         self.__dict__["coordinates"] = on_street(gaussians)
 
     def bytes_needed(self, gaussians: float) -> int:
-        return round(10 * gaussians)
+        return round(self.coarse + 10 * gaussians)
 
     def _contributions(self, text: str) -> Iterator[Float32]:
         assert text
@@ -95,9 +95,19 @@ def test_limits_that_no_division_meets_are_refused() -> None:
         "Any", SimpleNamespace(budget=100)
     )  # the limit if none is given: then blocks are trained in pieces
     loads, _ = warned(
-        "would still take .*but this device has 100 bytes: it will be slow", divided, heap, Partition("auto")
+        "would still take .*but this device has 100 bytes: training will run in pieces",
+        divided,
+        heap,
+        Partition("auto"),
     )
     assert loads.belongs.any(axis=1).all()
+    heap.coarse = 200  # bytes of the Gaussians around a block, however small it is
+    with pytest.raises(InputError, match=r"--block-mem 100 bytes: the coarse model, .*takes 200 bytes; expected more"):
+        divided(heap, Partition("auto", memory=100))
+    loads, _ = warned(
+        "the coarse model, .*takes 200 bytes, but this device has 100 bytes", divided, heap, Partition("auto")
+    )
+    assert loads.names == ("0_0",)
 
 
 def test_a_cell_without_points_is_joined() -> None:

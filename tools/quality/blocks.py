@@ -7,7 +7,7 @@ import shutil
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
@@ -18,9 +18,11 @@ from quality.trainings import Rows, call, trained, words_of
 
 from clsplat.arrays import Float32, Float64
 from clsplat.blocks import block_training
+from clsplat.blocks.block_settings import block_settings
 from clsplat.blocks.merging import region_of
-from clsplat.blocks.plan import BlockPlan, read_plan
+from clsplat.blocks.plan import Block, BlockPlan, read_plan
 from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
 from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
@@ -35,7 +37,12 @@ BAND_METRES = 3.0
 """Width, on each side of a border, of the band in which PSNR and colours are measured, in world units of the town."""
 EXTRA_STEPS = 1.05
 """Steps of the whole's training, as a multiple of --iterations, because the finish adds about as many to the blocks."""
-WORST_PSNR = 120.0
+LEAST_PIXELS = 200
+"""Least number of pixels of a view in the band, or elsewhere, that count."""
+OUTSIDE_CAMERAS = 8
+"""Number of cameras around a block that look at it from outside."""
+TALLEST = 80.0
+"""Height above the median point up to which Gaussians of a block are drawn from outside, in world units: no sky."""
 
 
 @dataclass
@@ -97,14 +104,15 @@ def ground_of(renderer: Renderer, model: Gaussians, views: Sequence[View], borde
 
 
 def psnrs(renders: Sequence[Float32], photographs: Sequence[Float32], ground: Ground, band: float) -> list[float]:
-    """PSNR in dB, by the mean squared error, of all pixels, of those in the band, and of those elsewhere."""
-    sums = np.zeros((3, 2))
+    """PSNR in dB of all pixels, of those in the band, and of those elsewhere: means over the views that have some."""
+    found: list[list[float]] = [[], [], []]
     for image, photograph, distance in zip(renders, photographs, ground.distances, strict=True):
         errors = np.square(np.clip(image, 0, 1).astype(np.float64) - photograph).mean(axis=2)
         known = np.isfinite(distance)
         for index, mask in enumerate((np.ones_like(known), known & (distance <= band), known & (distance > band))):
-            sums[index] += errors[mask].sum(), mask.sum()
-    return [float(-10 * np.log10(total / max(count, 1))) if total else WORST_PSNR for total, count in sums]
+            if mask.sum() >= LEAST_PIXELS:
+                found[index].append(float(-10 * np.log10(errors[mask].mean())))
+    return [float(np.mean(values)) for values in found]
 
 
 def colour_steps(
@@ -145,7 +153,15 @@ def no_surroundings() -> Iterator[None]:
         inside = take(model, region.contains(model.means, model.origin))
         return Start(inside, None, *rest, **named)  # type: ignore[arg-type]
 
-    with patch.object(block_training, "Start", start):
+    def without_frozen(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainConfig:
+        config = block_settings(plan, block, coarse)
+        most = config.density.max_gaussians - (plan.gaussians - block.gaussians)
+        return replace(config, density=replace(config.density, max_gaussians=most))
+
+    with (
+        patch.object(block_training, "Start", start),
+        patch.object(block_training, "block_settings", without_frozen),
+    ):
         yield
 
 
@@ -218,7 +234,7 @@ def blocks(given: Namespace) -> Rows:
         values = psnrs(pictures[name], photographs, ground, BAND_METRES)
         yield name, f"{len(model):,}", *(f"{value:.2f}" for value in values), f"{values[1] - values[2]:.2f}"
     save_pictures(given.folder / "pictures", scene, ground, photographs, pictures)
-    yield from floaters(given, renderer, scene, city, alone)
+    yield from floaters(given, renderer, scene, {"frozen": city, "without": alone}, done.model)
     if given.exposure:
         yield from exposures(given, renderer, scene, f"{settings},{growth}")
     return 0
@@ -236,36 +252,52 @@ def save_pictures(
         write_image(folder / f"{name}.png", np.clip(np.concatenate(rows, axis=1), 0, 1).astype(np.float32))
 
 
-def floaters(given: Namespace, renderer: Renderer, scene: Scene, city: Path, alone: Path) -> Rows:
-    """Gaussians of a block that stand for what lies outside it, and pictures of the block from outside."""
-    yield "block", "surroundings", "Gaussians in the widened cell", "opaque volume, m3"
-    plan = read_plan(city)
-    camera = from_outside(scene, plan)
-    for name, folder in (("frozen", city), ("without", alone)):
-        block = plan.blocks[0]
-        model = Gaussians.load(folder / "blocks" / block.name / "model.ply")
-        inside = take(model, region_of(plan, block.widened).contains(model.means, model.origin))
-        volume = np.exp(inside.log_scales.astype(np.float64).sum(axis=1)) / (1 + np.exp(-inside.opacity_logits))
-        yield block.name, name, f"{len(inside):,}", f"{volume.sum():.1f}"
-        image = renderer.render(inside, camera).image
-        write_image(given.folder / "pictures" / f"outside-{name}.png", np.clip(image, 0, 1))
+def floaters(given: Namespace, renderer: Renderer, scene: Scene, cities: dict[str, Path], whole: Gaussians) -> Rows:
+    """Blocks seen from outside, against the same part of the whole's model: what a block adds where the whole has
+    nothing, and PSNR. Writes a picture of each."""
+    yield "block seen from outside", "surroundings", "coverage where the whole has none", "PSNR to the whole, dB"
+    plan = read_plan(cities["frozen"])
+    cameras = from_outside(scene, plan)
+    wanted = [renderer.render(standing(whole, scene, plan), camera) for camera in cameras]
+    pictures = [wanted[0].image]
+    for name, city in cities.items():
+        model = Gaussians.load(city / "blocks" / plan.blocks[0].name / "model.ply")
+        found = [renderer.render(standing(model, scene, plan), camera) for camera in cameras]
+        pairs = list(zip(found, wanted, strict=True))
+        more = np.mean([np.maximum(one.alpha - other.alpha, 0)[other.alpha < 0.1].mean() for one, other in pairs])
+        psnr = np.mean([-10 * np.log10(np.square(one.image - other.image).mean()) for one, other in pairs])
+        yield plan.blocks[0].name.replace("_", ","), name, f"{100 * more:.2f} %", f"{psnr:.2f}"
+        pictures.append(found[0].image)
+    strip = np.clip(np.concatenate(pictures, axis=1), 0, 1).astype(np.float32)
+    write_image(given.folder / "pictures" / "outside-whole-frozen-without.png", strip)
     return 0
 
 
-def from_outside(scene: Scene, plan: BlockPlan) -> Camera:
-    """A camera that looks at the first block from outside and above."""
+def standing(model: Gaussians, scene: Scene, plan: BlockPlan) -> Gaussians:
+    """Gaussians over the first block's cell, up to TALLEST above the median point."""
+    up = np.array(plan.up)
+    heights = (model.means + model.origin) @ up - np.median(scene.points @ up)
+    inside = region_of(plan, plan.blocks[0].cell).contains(model.means, model.origin)
+    return take(model, inside & (heights < TALLEST))
+
+
+def from_outside(scene: Scene, plan: BlockPlan) -> list[Camera]:
+    """Cameras in a circle around the first block, which look at its middle from above."""
     axes, up = np.array(plan.axes), np.array(plan.up)
     points = scene.points @ axes.T
     cell = plan.blocks[0].cell
     low, high = np.maximum(cell.low, points.min(axis=0)), np.minimum(cell.high, points.max(axis=0))
     middle = (low + high) / 2 @ axes + up * np.median(scene.points @ up)
-    size = float(np.linalg.norm(high - low))
-    position = middle + up * size * 0.9 - (axes[0] + axes[1]) * size * 0.8
-    forward = (middle - position) / np.linalg.norm(middle - position)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(480, 320, 400.0, 400.0, 240.0, 160.0, rotation, -rotation @ position)
+    size, cameras = float(np.linalg.norm(high - low)), []
+    for angle in np.arange(OUTSIDE_CAMERAS) * 2 * np.pi / OUTSIDE_CAMERAS + np.pi / 4:
+        forward = -(np.cos(angle) * axes[0] + np.sin(angle) * axes[1]) * 0.85 - up * 0.53
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        position = middle - forward * 1.1 * size
+        cameras.append(Camera(320, 200, 260.0, 260.0, 160.0, 100.0, rotation, -rotation @ position))
+    return cameras
 
 
 def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str) -> Rows:

@@ -34,6 +34,9 @@ MIN_CAMERA_PLACES = 2
 MIN_LOAD_DROP = 0.95
 """Cuts for a limit go on as long as each round multiplies the largest load by at most this factor."""
 
+SLOW = "training will run in pieces, and be slower"
+"""Effect of too little device memory, for warnings."""
+
 
 def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division: Partition) -> BlockPlan:
     """Divide a scene into blocks, and measure their loads.
@@ -85,7 +88,8 @@ def coarse_cameras(coarse: Run, scene: Scene) -> list[Camera]:
 def divided(measurement: LoadMeasurement, division: Partition) -> tuple[CellLoads, list[str]]:
     """Divide the ground into the cells that `division` asks for, and measure their loads.
 
-    For "auto", there are as few cells as the limits allow. Cells that cannot be trained are joined to their neighbours.
+    For "auto", cells are halved until each is within the limits. Cells that cannot be trained are joined to their
+    neighbours.
     Returns the loads, and a line for each cell that was joined. Raises InputError for limits that no division meets.
     """
     asked = parse_blocks(division.blocks)
@@ -104,14 +108,14 @@ def _within(measurement: LoadMeasurement, division: Partition) -> Tree:
     Raises InputError if smaller cells do not help. For the memory of this device, which is the limit if no other is
     given, there is only a warning, as a training of more runs in pieces.
     """
-    memory, most = division.memory or measurement.device.budget, division.photographs
+    memory, most = _memory_limit(measurement, division), division.photographs or inf
     places = measurement.places
-    tree, before = balanced(places, min(ceil(len(places) / (most or len(places))), MAX_BLOCKS)), inf
+    tree, before = balanced(places, min(ceil(len(places) / most), MAX_BLOCKS)), inf
     while True:
         loads = measurement.of(tree)
         taken = [measurement.bytes_needed(gaussians) for gaussians in loads.around]
         counts = [int(count) for count in loads.belongs.sum(axis=0)]
-        parts = [max(size / memory, count / (most or inf)) for size, count in zip(taken, counts, strict=True)]
+        parts = [max(size / memory, count / most) for size, count in zip(taken, counts, strict=True)]
         largest = max(parts)
         if largest <= 1:
             return tree
@@ -126,13 +130,28 @@ def _within(measurement: LoadMeasurement, division: Partition) -> Tree:
                 )
             takes = f"the largest of {len(parts):,} blocks would still take {amount(max(taken))}"
             if division.memory is None:
-                warn(f"{takes}, and smaller blocks hardly less, but this device has {amount(memory)}: it will be slow")
+                warn(f"{takes}, and smaller blocks hardly less, but this device has {amount(int(memory))}: {SLOW}")
                 return tree
             raise InputError(
-                f"--block-mem {amount(memory)}: {takes}, and smaller blocks hardly less; expected at least that, or a "
-                "smaller --resolution"
+                f"--block-mem {amount(int(memory))}: {takes}, and smaller blocks hardly less; expected at least that, "
+                "or a smaller --resolution"
             )
         tree, before = finer, largest
+
+
+def _memory_limit(measurement: LoadMeasurement, division: Partition) -> float:
+    """Return the largest number of bytes of device memory of a block; infinite, with a warning, if it cannot be met.
+
+    Raises InputError if `division` asks for less memory than the smallest block takes.
+    """
+    memory, least = division.memory or measurement.device.budget, measurement.bytes_needed(0)
+    if least <= memory:
+        return memory
+    takes = f"the coarse model, which is drawn around each block, takes {amount(least)}"
+    if division.memory is None:
+        warn(f"{takes}, but this device has {amount(memory)}: {SLOW}")
+        return inf
+    raise InputError(f"--block-mem {amount(memory)}: {takes}; expected more than that, or a smaller --resolution")
 
 
 def _joined(measurement: LoadMeasurement, tree: Tree) -> tuple[CellLoads, list[str]]:

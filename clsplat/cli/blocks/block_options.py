@@ -31,8 +31,8 @@ class WholeInBlocks(DivisionOptions):
 
     blocks: Annotated[str | None, arg(metavar="auto|N|NxM")] = None
     """Train a large scene in blocks, each on its own, and merge them: as clsplat blocks plan, train, merge and finish.
-    The number of blocks, numbers along both axes of the ground, or auto: as few as --block-mem and --block-photographs
-    allow. The same command, or --resume, goes on after an interruption."""
+    The number of blocks, numbers along both axes of the ground, or auto: halved until each is within --block-mem and
+    --block-photographs. The same command, or --resume, goes on after an interruption."""
     workers: OptionalInt = None
     """With --blocks: number of processes on this machine, each of which trains a block at a time. If not given: this
     process trains one after another."""

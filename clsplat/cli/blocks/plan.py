@@ -53,8 +53,8 @@ class BlocksPlanVerb(Verb):
     """Folder for the plan, plan.json, its picture, plan.svg, and the coarse model's run, coarse/. Blocks, the merged
     model and the result are written to the same folder later."""
     blocks: Annotated[str, arg(metavar="auto|N|NxM")] = "auto"
-    """Number of blocks, or numbers along both axes of the ground. auto: as few as --block-mem and --block-photographs
-    allow."""
+    """Number of blocks, or numbers along both axes of the ground. auto: blocks are halved until each is within
+    --block-mem and --block-photographs."""
     limits: Annotated[DivisionOptions, arg(name="")] = field(default_factory=DivisionOptions)
     device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
     preset: Preset = "default"
