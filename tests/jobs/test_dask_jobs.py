@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import dispatching
@@ -74,7 +75,7 @@ def test_workers_that_are_killed(tmp_path: Path, cluster: DaskProcesses, told: l
     assert sum(begun) == 5, "one task was begun again"
 
 
-def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses) -> None:
+def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses, capfd: pytest.CaptureFixture[str]) -> None:
     """One line; the commands end with their workers; the same tasks go on with a new scheduler."""
     tasks = [counting_task(tmp_path, str(number), 100, seconds=0.02) for number in range(2)]
     kills: list[str] = []
@@ -90,6 +91,7 @@ def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses) -> N
 
     message = "the scheduler was lost; what is done stays, and the same command goes on when a scheduler runs again"
     refuses(f"--scheduler {cluster.address}: {message}", run, error=ClsplatError)
+    assert "Traceback" not in capfd.readouterr().err
     pids = [int((tmp_path / f"{task.name}.pid").read_text()) for task in tasks]
     until = time.monotonic() + 60
     while any(map(alive, pids)) and time.monotonic() < until:
@@ -191,6 +193,18 @@ def test_what_a_worker_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert found.kind == "unfit" and "expected 9.9 like the dispatcher" in found.reason
     assert dask_engine._attempts_here == {}
     dask_engine.end_on_worker(["unknown"])
+
+
+def test_the_last_good_worker_leaves() -> None:
+    """The workers that stay are left out, so that nothing would ever go on."""
+    workers: dict[str, dict[str, Any]] = {"tcp://a": {}, "tcp://b": {}}
+    client = SimpleNamespace(status="running", scheduler_info=lambda: {"workers": workers})
+    engine = dask_engine.DaskEngine(client, "tcp://s")
+    assert engine.free() == 2
+    assert engine.leave_out("tcp://a") and engine.free() == 1
+    del workers["tcp://b"]
+    engine._looked_at = float("-inf")
+    refuses("--scheduler tcp://s: has no workers but those that are left out", engine.free, error=ClsplatError)
 
 
 def test_a_command_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
