@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from groups import begin_apart, in_one_order, scheduler
 from needs import missing
 from passed import leave_out, pytest_addoption, record  # noqa: F401  # a hook
-from pipeline import COMMON_SHAPES, has_slow_parameters, shaped, shapes_of
+from pipeline import COMMON_SHAPES, DEFAULT, has_slow_parameters, shaped, shapes_of
 from same_bytes import undisturbed  # noqa: F401  # a fixture
 from tiny import CONFIG, FEW, short, write_scene
 
@@ -44,6 +46,13 @@ def pytest_configure(config: pytest.Config) -> None:
     check_some_are_kept()
     record(config)
     begin_apart(config)
+    gc.disable()  # until the end of the collection, whose objects are all kept
+
+
+def pytest_collection_finish() -> None:
+    """Let garbage collections skip the objects of the collection: they are half a million, and each takes 0.4 s."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
@@ -96,9 +105,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 @pytest.fixture(scope="session", params=KEPT, ids=label)
-def device(request: pytest.FixtureRequest) -> Device:
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
     """Each driver in turn, in its own shape."""
-    return open_device(str(request.param))
+    yield (device := open_device(str(request.param)))
+    if request.param not in DEFAULT:  # the default device's kernels are used by tests of other fixtures
+        device._kernels.clear()  # otherwise each process would come to hold all kernels of all drivers
 
 
 @pytest.fixture(scope="session")
@@ -116,10 +127,11 @@ def _shaped_label(parameter: tuple[int, tuple[int, ...]]) -> str:
 
 
 @pytest.fixture(scope="session", params=SHAPED, ids=_shaped_label)
-def shaped_device(request: pytest.FixtureRequest) -> Device:
+def shaped_device(request: pytest.FixtureRequest) -> Iterator[Device]:
     """Each driver in kernel shapes."""
     index, shape = request.param
-    return shaped(open_device(str(index)), *shape)
+    yield shaped(open_device(str(index)), *shape)
+    shaped.cache_clear()  # frees the kernels of all shapes, before those of the next driver or shape are built
 
 
 @pytest.fixture(scope="session")

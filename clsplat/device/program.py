@@ -116,6 +116,16 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
         ) from None
 
 
+def kernels_of(program: cl.Program) -> dict[str, cl.Kernel]:
+    """Return the kernels of a built program, by name.
+
+    `Program.all_kernels` would leak them: pyopencl 2026.1 retains each kernel twice and releases it once, so that the
+    driver keeps the kernel and the program for ever.
+    """
+    names: str = program.get_info(cl.program_info.KERNEL_NAMES)
+    return {name: cl.Kernel(program, name) for name in names.split(";")}
+
+
 class Kernel:
     """A built kernel.
 
@@ -147,7 +157,7 @@ class Kernels:
     """The built kernels of a kernel file with certain defines. Each kernel is an attribute, by its name."""
 
     def __init__(self, variant: Variant, program: cl.Program) -> None:
-        self._kernels = {kernel.function_name: Kernel(variant, program, kernel) for kernel in program.all_kernels()}
+        self._kernels = {name: Kernel(variant, program, kernel) for name, kernel in kernels_of(program).items()}
 
     def __getattr__(self, name: str) -> Kernel:
         try:

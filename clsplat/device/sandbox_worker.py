@@ -18,7 +18,7 @@ import pyopencl as cl
 from clsplat.device.context import all_devices
 from clsplat.device.drivers.quirks import caches_programs
 from clsplat.device.drivers.worker_process import tell
-from clsplat.device.program import Variant, build
+from clsplat.device.program import Variant, build, kernels_of
 from clsplat.errors import DriverError, KernelBuildError
 
 
@@ -52,7 +52,7 @@ class _TrialDevice:
             salt = ""
             if variant.digest not in self._kernels:
                 program, salt = build(self._context, self._device, variant)
-                self._kernels[variant.digest] = {kernel.function_name: kernel for kernel in program.all_kernels()}
+                self._kernels[variant.digest] = kernels_of(program)
                 if caches_programs(self._device) and build(self._context, self._device, variant.anew(salt))[1]:
                     return {"trouble": "has no kernels after it was loaded from the driver's cache"}
             if "launch" in message:

@@ -42,6 +42,11 @@ def test_scalars_arrive_as_they_are(default_device: Device, words: Kernel) -> No
         assert out.get().tolist() == [a, b % 2**32, bits, d >> 32, d % 2**32]
 
 
+def test_no_reference_to_a_kernel_is_left_behind(words: Kernel) -> None:
+    """Otherwise the driver would keep each program for ever, of which a run of all tests builds thousands."""
+    assert words.cl_kernel.reference_count == 1
+
+
 def test_types_are_told_once(default_device: Device, words: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
     """An untyped scalar takes OpenCL's wrapper ten microseconds, a typed one half of one."""
     out = allocate(default_device, (5,), np.uint32)

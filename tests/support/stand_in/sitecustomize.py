@@ -55,7 +55,7 @@ def _end_badly(how: str) -> None:
 
 def _misbehave(cl: Any) -> None:
     how, first, last, file = os.environ["CLSPLAT_STAND_IN"].split(" ", 3)
-    real_build, real_kernels = cl.Program.build, cl.Program.all_kernels
+    real_build, real_kernel, real_enqueue = cl.Program.build, cl.Kernel, cl.enqueue_nd_range_kernel
     texts: dict[Any, str] = {}
 
     def is_doomed(text: str, name: str) -> bool:
@@ -87,11 +87,13 @@ def _misbehave(cl: Any) -> None:
         def __getattr__(self, name: str) -> Any:
             return getattr(self._kernel, name)
 
-    def all_kernels(self: Any) -> list[Any]:
-        kernels = real_kernels(self)
-        return [Launched(kernel, texts[self]) for kernel in kernels] if how == "launch" else kernels
+    def enqueue(queue: Any, launched: Any, *arguments: Any) -> Any:
+        return real_enqueue(queue, launched._kernel, *arguments)
 
-    cl.Program.build, cl.Program.all_kernels = build, all_kernels
+    cl.Program.build = build
+    if how == "launch":
+        cl.Kernel = lambda program, name: Launched(real_kernel(program, name), texts[program])
+        cl.enqueue_nd_range_kernel = enqueue
 
 
 class _Finder(MetaPathFinder):
