@@ -234,12 +234,14 @@ def project_grad(
     explore: penalties on opacity and scale, whose gradients are added.
     by_lens: (n, 4), filled with each Gaussian's gradient with respect to the logs of the focal lengths and to the
     principal point in pixels, for a camera with an image plane.
+
+    If only some chunks of `gaussians` were projected, the gradients have the rows of `projected`.
     """
     weights, build = explore.weights, _build(device)
-    defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
+    defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines, **projected.chunk_defines}
     defines |= {"PENALTIES": True} if weights else {}
     defines |= {} if by_lens is None else {"LENS": True}
-    n = gaussians.count
+    n = projected.tile_counts.shape[0]
     launch_items(
         device,
         device.kernels("project_grad", defines).project_grad,
@@ -251,6 +253,7 @@ def project_grad(
         *([screen.contributions] if slots.fields.contributions else []),
         *([] if by_lens is None else [by_lens]),
         *weights,
+        *projected.chunk_arguments,
     )
 
 

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A training step of several views (--batch), on one device or several: gradients are summed, then Adam steps once.
 
-The first device has the model. Each further device has a thread and a copy of the parameters, and returns the results
-of its views. Gradients are summed in the order of the views, so neither the speed nor the number of devices changes a
-bit of the result.
+The first device has the model. Each further device has a thread, gets the parameters that its views show, and returns
+the results of its views. Of a large model these are chunks of Gaussians, otherwise all Gaussians. Gradients are summed
+in the order of the views, so neither the speed nor the number of devices changes a bit of the result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from math import sqrt
 from typing import Any
@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config.training import OptimiserConfig, TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, shared, upload
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
-from clsplat.layouts.columns import SPLAT
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.step_noise import Exploration
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.adam import adam, add_view
+from clsplat.stages.chunk_lists import ChunkList
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,
@@ -40,8 +40,11 @@ from clsplat.stages.device_gaussians import (
 from clsplat.stages.loss import Loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
+from clsplat.training.batch_chunks import BatchChunks, ChunkSums
+from clsplat.training.learning_rates import scaled, scaled_rates
+from clsplat.training.replica import Replica, ViewOutcome, reused
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, view_gradients
-from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.step.inputs import PlacedChunks, StepRows, ViewInputs, ViewRows
 from clsplat.training.supervision.image_cache import ImageCache
 
 OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER = 5, 2
@@ -50,24 +53,6 @@ OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER = 5, 2
 The first has the parameter, two moments, a view's gradient and the sum of gradients; a further device the parameter and
 a view's gradient.
 """
-
-
-def scaled(config: OptimiserConfig, batch: int) -> OptimiserConfig:
-    """Return Adam's settings for steps of `batch` views: moments decay as much per view as in steps of one view.
-
-    Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training", section 4.
-    """
-    every = max(config.sh_rest_every // batch, 1)
-    return replace(config, beta1=config.beta1**batch, beta2=config.beta2**batch, sh_rest_every=every)
-
-
-def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
-    """Return the learning rates for steps of `batch` views, from `rates` for steps of one view.
-
-    Gradients of different views are nearly independent, so their sum grows with the root of their number. Adam divides
-    by the sum's size, which cancels this growth, so the rates are multiplied by the root (Zhao et al. 2024, section 4).
-    """
-    return {group: rate * sqrt(batch) for group, rate in rates.items()}
 
 
 def shares(count: int, devices: int) -> list[range]:
@@ -92,156 +77,39 @@ class Losses:
 class _AddedView(GradientStep):
     """Step of one view that adds the view's gradients to the batch's sums, instead of taking Adam's step.
 
-    The `model` that it runs on consists of the parameters and the batch's sums of gradients, without moments.
+    The `model` that it runs on consists of the parameters and the batch's sums of gradients, without moments; in a step
+    over chunks, of the parameters alone.
 
     own: gradients of each view's parts (`ViewPart`), by the view's position in the batch.
     noise: noise that the batch adds after its last view.
+    chunks: the chunks that the batch's views show; None if the step runs over the whole model.
     """
 
     own: dict[int, Sequence[DeviceArray | None]]
     noise: Exploration
+    _: KW_ONLY
+    chunks: BatchChunks | None = None
+
+    def place(self, model: tuple[AnyGaussians, ...], inputs: ViewInputs) -> PlacedChunks | None:
+        """Send the list of the view's chunks, which the batch has prepared."""
+        return None if self.chunks is None or inputs.chunks is None else inputs.chunks.place(model)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
         """Keep the gradients of the view's parts until the batch ends, as all its views use the same parameters."""
         self.own[inputs.place] = own
 
-    def update(self, rows: StepRows) -> None:
+    def update(self, rows: StepRows, inputs: ViewInputs) -> None:
         """Add the rows' gradients to the sums. In a sandbox trial, also try the kernels that follow the last view."""
         assert rows.gradients is not None, "the batch asks for them"
-        parameters, sums = rows.model
-        step, counts = self.adam_step, rows.projected.tile_counts
-        add_view(self.device, counts, rows.gradients, sums, sh_rest=step.updates_sh_rest)
+        parameters, step, chunks = rows.parameters, self.adam_step, self.chunks
+        sums = rows.model[1] if chunks is None else chunks.sums
+        places = None if chunks is None else chunks.places(inputs, rows.start, rows.stop)
+        counts, sh_rest = rows.projected.tile_counts, step.updates_sh_rest
+        add_view(self.device, counts, rows.gradients, sums, sh_rest=sh_rest, places=places)
         if self.device.only_tries:
-            models = (parameters, sums, rows.gradients, rows.gradients)
-            adam(self.device, step, *models, readback=self.rasterizer.readback)
+            models = (parameters, rows.gradients, parameters, parameters)
+            adam(self.device, step, *models, readback=self.rasterizer.readback, chunks=rows.projected.chunks)
             noise(self.device, self.noise, parameters, rows.start, self.rasterizer.readback)
-
-
-@dataclass(frozen=True, eq=False)
-class ViewOutcome:
-    """Results of a view that a further device computed, on the host until the next step.
-
-    arrays: tile counts, splats, screen-space gradients and contributions of all Gaussians, by name.
-    gradients: gradients of all Gaussians, by parameter group.
-    own: gradients of the view's parts, such as its appearance; None for a part without parameters.
-    """
-
-    arrays: dict[str, NDArray[Any]]
-    gradients: dict[str, NDArray[np.float32]]
-    loss: Loss
-    own: Sequence[NDArray[Any] | None] = ()
-
-
-@dataclass(eq=False)
-class _RemoteView(GradientStep):
-    """Step of one view on a further device. It copies the view's results to the host, instead of taking Adam's step."""
-
-    arrays: dict[str, NDArray[Any]]
-    outcome: dict[str, NDArray[np.float32]]
-    own: list[NDArray[Any] | None]
-
-    def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:  # noqa: ARG002
-        """Copy the parts' gradients to the host, for Adam on the first device."""
-        self.own.extend(None if gradient is None else gradient.get() for gradient in own)
-
-    def update(self, rows: StepRows) -> None:
-        """Copy the results for these rows to the host: their gradients, and the values that density control needs."""
-        assert rows.gradients is not None, "the batch asks for them"
-        on_device = {
-            "tile_counts": rows.projected.tile_counts,
-            "splats": rows.projected.splats,
-            "screen": rows.screen.gradients,
-            "contributions": rows.screen.contributions,
-        }
-        for name, host in self.arrays.items():
-            array = on_device[name]
-            assert array is not None, name
-            array.read_into(host[rows.start : rows.stop])
-        for group, host in self.outcome.items():
-            shape = (rows.stop - rows.start, *host.shape[1:])
-            rows.gradients[group].reshaped(*shape).read_into(host[rows.start : rows.stop])
-
-
-class Replica:
-    """Further device of a training, with a copy of the parameters and a thread of its own."""
-
-    def __init__(self, device: Device, config: TrainConfig, photographs: ImageCache) -> None:
-        self.device, self.config = device, config
-        self.photographs = ImageCache(device, photographs.host)
-        self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
-        self.thread = ThreadPoolExecutor(1, f"clsplat-{device.name}")
-        self.plan: Plan | None = None
-        self.parameters: AnyGaussians | None = None
-        self._room: dict[tuple[int, str], NDArray[Any]] = {}
-
-    def follow(self, plan: Plan) -> None:
-        """Use at most the device memory that `plan` allows. Arrays of an earlier plan are freed."""
-        self.plan, self.parameters = plan, None
-        self._room.clear()
-        self.rasterizer.follow(plan)
-        self.photographs.follow(plan.photographs)
-
-    def take(self, values: Mapping[str, NDArray[np.float32]], coefficients: int) -> None:
-        """Upload the model's parameters from the host.
-
-        values: parameters by group. A group that is left out keeps its values.
-        coefficients: number of SH coefficients of the model.
-        """
-        assert self.plan is not None, "planned before the first step"
-        count = self.plan.need.gaussians
-        if self.parameters is None or self.parameters.coefficients != coefficients:
-            self.parameters = None
-            if self.plan.streamed:
-                self.parameters = host_zeros(count, coefficients, self.plan.rows)
-            else:
-                self.parameters = allocate_gaussians(self.device, count, coefficients)
-        for group, array in values.items():
-            self.parameters[group].set(array)
-
-    def view(
-        self,
-        place: int,
-        inputs: ViewInputs,
-        factor: float,
-        step: GradientStep,
-        values: Sequence[NDArray[np.float32]],
-        *,
-        splats: bool,
-    ) -> ViewOutcome:
-        """Run forward, loss and backward of a view on this device.
-
-        place: the view's position among this device's views of the batch.
-        factor: divisor of the photographs' resolution.
-        step: the step of the batch's views on the first device, from which this device takes all settings.
-        values: parameters of each of `inputs.parts`, as `ViewPart.values` returned them.
-        splats: True to return splats and screen-space gradients too, which density control uses.
-        """
-        parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
-        assert parameters is not None, "taken before the view"
-        n, sh_rest = parameters.count, step.adam_step.updates_sh_rest
-        shapes = group_shapes(n, parameters.coefficients)
-        gradients = {g: self._host(place, g, shapes[g]) for g in PARAMETER_GROUPS if g != "sh_rest" or sh_rest}
-        arrays = {"tile_counts": self._host(place, "tile_counts", (n,), np.uint32)}
-        if splats:
-            arrays["splats"] = self._host(place, "splats", (n, len(SPLAT)))
-            arrays["screen"] = self._host(place, "screen", (n, 2))
-        if step.fields.contributions:
-            arrays["contributions"] = self._host(place, "contributions", (n,))
-        settings = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
-        room = view_gradients(self.rasterizer.work, parameters)
-        shares = tuple(part.on(self.device, each) for part, each in zip(inputs.parts, values, strict=True))
-        own: list[NDArray[Any] | None] = []
-        view = _RemoteView(*settings, arrays, gradients, own, explore=step.explore)
-        here = replace(inputs, photograph=photograph, parts=shares)
-        return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
-
-    def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Return the host array that takes the result `name` of a view. place: the view's position among this device's
-        views of the batch. The array is reused in each step: fresh memory would take as much time as the copy."""
-        held = self._room.get((place, name))
-        if held is None or held.shape != shape:
-            held = self._room[place, name] = np.empty(shape, dtype)
-        return held
 
 
 class Batch:
@@ -264,13 +132,17 @@ class Batch:
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
         self._sums: AnyGaussians | None = None
+        self._chunk_sums = ChunkSums()
         self._sent: AnyGaussians | None = None
-        self._room: dict[str, NDArray[np.float32]] = {}
+        self._room: dict[tuple[int, str], NDArray[Any]] = {}
+        self.moved_bytes = 0
+        """Bytes of Gaussians that have moved between the devices so far, in both directions."""
 
     def follow(self, plans: Sequence[Plan]) -> None:
         """Use at most the device memory that `plans` allow: a plan for each further device. Frees arrays of earlier
         plans."""
         self._sums = self._sent = None
+        self._chunk_sums.free()
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
             replica.follow(plan)
@@ -301,43 +173,77 @@ class Batch:
         probes: function that makes the `StepProbe` of a view from the view's inputs and its step.
         statistics: True if density control uses the views' gradients.
         """
-        batch, work, device = self.config.batch, self.rasterizer.work, step.device
-        optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
-        config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
-        sums = self._sums_for(device, model[0])
-        own: dict[int, Sequence[DeviceArray | None]] = {}
-        explore = step.explore.scaled(sqrt(batch))
-        settings = (device, self.rasterizer, config, number, rates, step.fields, own, explore)
-        step_of_view = _AddedView(*settings, explore=step.explore.of_view())
-        adam_step = step_of_view.adam_step
+        settings = self._settings(step)
+        adam_step = settings.adam_step
+        chunks = BatchChunks.begin(self.rasterizer.work, step.device, model, views, adam_step, self._chunk_sums)
+        added = replace(settings, chunks=chunks)
+        own, sums = added.own, self._sums_for(step.device, model[0]) if chunks is None else None
         first, *others = shares(len(views), 1 + len(self.replicas))
-        transfers = self._send(model[0])
+        transfers = self._send(model[0]) if chunks is None else []
         pending: list[tuple[int, Future[ViewOutcome]]] = []
         try:
             for replica, share in zip(self.replicas, others, strict=True):
                 for place, index in enumerate(share):
                     values = [part.values() for part in views[index].parts]
-                    view = partial(replica.view, place, views[index], factor, step_of_view, values, splats=statistics)
+                    view: Callable[[], ViewOutcome]
+                    view = partial(replica.view, place, views[index], factor, added, values, splats=statistics)
+                    if chunks is not None:
+                        view = self._with_chunks(replica, chunks, views[index], view)
                     pending.append((index, replica.thread.submit(view)))
-            losses = [self._view((model[0], sums), views[index], factor, step_of_view, probes) for index in first]
+            losses = [self._view((model[0], sums), views[index], factor, added, probes) for index in first]
             for transfer in transfers:
                 transfer.result()
             for index, future in pending:
                 outcome = future.result()
-                losses.append(self._take(model[0], sums, outcome, step_of_view, probes(views[index], step_of_view)))
-                own[index] = [None if each is None else upload(device, each) for each in outcome.own]
+                losses.append(self._take((model[0], sums), views[index], outcome, added, probes(views[index], added)))
+                own[index] = [None if each is None else upload(step.device, each) for each in outcome.own]
         finally:  # after an error, no thread may still be working on this batch
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
-        for start, _, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
-            models = (parameters, gradients, moments, squares)
-            adam(device, adam_step, *models, readback=self.rasterizer.readback)
-            noise(device, explore, parameters, start, self.rasterizer.readback)
+        self._take_adam_step(added, model, sums)
         for inputs in views:
             for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
                 part.update(gradient, self.rasterizer.readback)
-        self._sent = None if adam_step.updates_sh_rest else model[0]
+        self._sent = None if adam_step.updates_sh_rest or chunks is not None else model[0]
         return Losses(tuple(losses))
+
+    def _settings(self, step: GradientStep) -> _AddedView:
+        """Return the step of each view of a batch. step: settings of the batch, whose step number counts views."""
+        batch = self.config.batch
+        config = replace(self.config, optimiser=scaled(self.config.optimiser, batch))
+        number, rates, explore = -(-step.step // batch), scaled_rates(step.rates, batch), step.explore
+        own: dict[int, Sequence[DeviceArray | None]] = {}
+        of = (step.device, self.rasterizer, config, number, rates, step.fields, own, explore.scaled(sqrt(batch)))
+        return _AddedView(*of, explore=explore.of_view())
+
+    def _take_adam_step(
+        self,
+        step: _AddedView,
+        model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
+        sums: AnyGaussians | None,
+    ) -> None:
+        """Take Adam's step with the sums of gradients. sums: None in a step over chunks, which has its own sums."""
+        device, of, readback = step.device, step.adam_step, self.rasterizer.readback
+        if step.chunks is not None:
+            for (parameters, first, second), gradients, listed in step.chunks.for_adam():
+                adam(device, of, parameters, gradients, first, second, readback=readback, chunks=listed)
+            return
+        assert sums is not None, "a step over the whole model"
+        for start, _, (parameters, first, second, gradients) in parts(self.rasterizer.work, *model, sums, keep=True):
+            adam(device, of, parameters, gradients, first, second, readback=readback)
+            noise(device, step.noise, parameters, start, readback)
+
+    def _with_chunks(
+        self, replica: Replica, chunks: BatchChunks, inputs: ViewInputs, view: Callable[[], ViewOutcome]
+    ) -> Callable[[], ViewOutcome]:
+        """Return a function that sends the parameters of a view's chunks to a further device, and runs `view` there."""
+
+        def room(group: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+            return reused(self._room, (inputs.place, group), shape)
+
+        values = chunks.parameters(inputs, room)
+        self.moved_bytes += sum(array.nbytes for array in values.values())
+        return partial(replica.view_of_chunks, values, chunks.sums.coefficients, view)
 
     def _sums_for(self, device: Device, parameters: AnyGaussians) -> AnyGaussians:
         """Return arrays for the sums of gradients. They contain zeros, as `adam` sets them to zero after each use."""
@@ -359,21 +265,20 @@ class Batch:
             return []
         groups = [group for group in PARAMETER_GROUPS if group != "sh_rest" or self._sent is not parameters]
         values = {group: self._on_host(group, parameters) for group in groups}
+        self.moved_bytes += len(self.replicas) * sum(array.nbytes for array in values.values())
         return [replica.thread.submit(replica.take, values, parameters.coefficients) for replica in self.replicas]
 
     def _on_host(self, group: str, parameters: AnyGaussians) -> NDArray[np.float32]:
         array = parameters[group]
         if not isinstance(array, DeviceArray):
             return array.values if isinstance(array, HostArray) else array.get()
-        held = self._room.get(group)
-        if held is None or held.shape != array.shape:
-            held = self._room[group] = np.empty(array.shape, np.float32)
+        held = reused(self._room, (0, group), array.shape)
         array.read_into(held)
         return held
 
     def _view(
         self,
-        model: tuple[AnyGaussians, AnyGaussians],
+        model: tuple[AnyGaussians, AnyGaussians | None],
         inputs: ViewInputs,
         factor: float,
         step: _AddedView,
@@ -381,35 +286,65 @@ class Batch:
     ) -> Loss:
         """Run the step of a view on the first device, and return its loss.
 
-        model: parameters, and sums of gradients.
+        model: parameters, and sums of gradients; no sums in a step over chunks, which has its own.
         probes: function that makes the view's `StepProbe` from the view's inputs and its step.
         """
-        gradients = view_gradients(self.rasterizer.work, model[0])
+        rows = None if step.chunks is None else step.chunks.gradient_rows(inputs)
+        gradients = view_gradients(self.rasterizer.work, model[0], rows)
         inputs = replace(inputs, photograph=self.photographs.bring(inputs.view, factor))
-        return step.run(model, inputs, probes(inputs, step), gradients, reads_loss=True)
+        given = tuple(each for each in model if each is not None)
+        return step.run(given, inputs, probes(inputs, step), gradients, reads_loss=True)
 
     def _take(
-        self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
+        self,
+        model: tuple[AnyGaussians, AnyGaussians | None],
+        inputs: ViewInputs,
+        outcome: ViewOutcome,
+        step: _AddedView,
+        probe: StepProbe,
     ) -> Loss:
         """Add the gradients of a view that a further device has computed to the sums, and the view's other results to
         the density statistics (`probe.after_rows`). Returns the view's loss.
 
-        parameters: the model's parameters. If they are streamed, results are added for a part of the rows at a time.
+        model: as in `_view`. If the model is streamed, results are added for a part of the rows at a time.
         outcome: results of the view on the host. They pass through scratch arrays on the first device.
         """
-        device, work = step.device, self.rasterizer.work
+        self.moved_bytes += outcome.nbytes
         probe.loss(outcome.loss)
-        for start, stop, (_, part) in parts(work, parameters, sums, keep=True):
-            rows = {name: _brought(work, device, name, values[start:stop]) for name, values in outcome.arrays.items()}
-            arrays = {
-                group: _brought(work, device, f"view_{group}", values[start:stop])
-                for group, values in outcome.gradients.items()
-            }
-            gradients, counts = DeviceGaussians(part.count, part.coefficients, arrays), rows["tile_counts"]
-            add_view(device, counts, gradients, part, sh_rest="sh_rest" in arrays)
-            screen = Screen(rows.get("screen", counts), rows.get("contributions"))
-            probe.after_rows(ViewRows(start, stop, Projected(rows.get("splats", counts), counts), screen))
+        chunks, add = step.chunks, partial(self._add_rows, outcome, step, probe)
+        if chunks is None:
+            assert model[1] is not None, "a step over the whole model"
+            for start, stop, (_, part) in parts(self.rasterizer.work, model[0], model[1], keep=True):
+                add(start, stop, part)
+            return outcome.loss
+        for start, stop, listed in chunks.of_view(inputs, len(outcome.arrays["tile_counts"])):
+            add(start, stop, chunks.sums, chunks.places(inputs, start, stop), listed)
         return outcome.loss
+
+    def _add_rows(
+        self,
+        outcome: ViewOutcome,
+        step: _AddedView,
+        probe: StepProbe,
+        start: int,
+        stop: int,
+        sums: DeviceGaussians,
+        places: ChunkList | None = None,
+        listed: ChunkList | None = None,
+    ) -> None:
+        """Add the rows [start, stop) of a view's results to the sums and the statistics.
+
+        places: for each chunk of the rows its place in `sums`; listed: the chunks themselves. Both are None in a step
+            over the whole model.
+        """
+        device, brought = step.device, partial(_brought, self.rasterizer.work, step.device)
+        rows = {name: brought(name, values[start:stop]) for name, values in outcome.arrays.items()}
+        arrays = {group: brought(f"view_{group}", values[start:stop]) for group, values in outcome.gradients.items()}
+        gradients, counts = DeviceGaussians(stop - start, sums.coefficients, arrays), rows["tile_counts"]
+        add_view(device, counts, gradients, sums, sh_rest="sh_rest" in arrays, places=places)
+        projected = Projected(rows.get("splats", counts), counts, chunks=listed)
+        screen = Screen(rows.get("screen", counts), rows.get("contributions"))
+        probe.after_rows(ViewRows(start, stop, projected, screen))
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:

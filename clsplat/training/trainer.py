@@ -116,8 +116,8 @@ class Trainer:
         cameras = [self.local(view.camera) for view in self.views]
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
         late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
-        next_camera = partial(self.loader.next_camera, self.position)
-        chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial), next_camera)
+        next_cameras = partial(self.loader.next_cameras, self.position)
+        chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial), next_cameras)
         self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths, chunks)
         self._active = [component for component in self.components if component.on]
         of, files = (self.device, self.rasterizer.work), (self.planner.scratch_file, self.planner.scratch_files)
