@@ -33,14 +33,13 @@ from clsplat.stages.device_gaussians import (
     DeviceGaussians,
     HostArray,
     HostGaussians,
-    allocate_gaussians,
     host_zeros,
     parts,
 )
 from clsplat.stages.loss import Loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
-from clsplat.training.batch_chunks import BatchChunks, ChunkSums
+from clsplat.training.batch_chunks import BatchChunks, GradientSums
 from clsplat.training.learning_rates import scaled, scaled_rates
 from clsplat.training.replica import Replica, ViewOutcome, reused
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, view_gradients
@@ -131,8 +130,8 @@ class Batch:
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
-        self._sums: AnyGaussians | None = None
-        self._chunk_sums = ChunkSums()
+        self._sums = GradientSums()
+        self._streamed_sums: HostGaussians | None = None
         self._sent: AnyGaussians | None = None
         self._room: dict[tuple[int, str], NDArray[Any]] = {}
         self.moved_bytes = 0
@@ -141,8 +140,8 @@ class Batch:
     def follow(self, plans: Sequence[Plan]) -> None:
         """Use at most the device memory that `plans` allow: a plan for each further device. Frees arrays of earlier
         plans."""
-        self._sums = self._sent = None
-        self._chunk_sums.free()
+        self._sent = self._streamed_sums = None
+        self._sums.free()
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
             replica.follow(plan)
@@ -175,7 +174,7 @@ class Batch:
         """
         settings = self._settings(step)
         adam_step = settings.adam_step
-        chunks = BatchChunks.begin(self.rasterizer.work, step.device, model, views, adam_step, self._chunk_sums)
+        chunks = BatchChunks.begin(self.rasterizer.work, step.device, model, views, adam_step, self._sums)
         added = replace(settings, chunks=chunks)
         own, sums = added.own, self._sums_for(step.device, model[0]) if chunks is None else None
         first, *others = shares(len(views), 1 + len(self.replicas))
@@ -246,17 +245,15 @@ class Batch:
         return partial(replica.view_of_chunks, values, chunks.sums.coefficients, view)
 
     def _sums_for(self, device: Device, parameters: AnyGaussians) -> AnyGaussians:
-        """Return arrays for the sums of gradients. They contain zeros, as `adam` sets them to zero after each use."""
-        count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
-        if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
-            del sums
-            self._sums = None
-            if isinstance(parameters, HostGaussians):
-                self._sums = host_zeros(count, coefficients, parameters.rows)
-            else:
-                self._sums = allocate_gaussians(device, count, coefficients, zero=True)
-            sums = self._sums
-        return sums
+        """Return sums of gradients for a step over the whole model. They contain zeros, as `adam` sets them to zero."""
+        count, coefficients, held = parameters.count, parameters.coefficients, self._streamed_sums
+        if not isinstance(parameters, HostGaussians):
+            return self._sums.take(device, count, coefficients)
+        if held is None or (held.count, held.coefficients) != (count, coefficients):
+            del held
+            self._streamed_sums = None
+            held = self._streamed_sums = host_zeros(count, coefficients, parameters.rows)
+        return held
 
     def _send(self, parameters: AnyGaussians) -> list[Future[None]]:
         """Begin to send the parameters to the further devices, without the higher SH bands if these are unchanged.

@@ -33,8 +33,8 @@ HostRoom = Callable[[str, tuple[int, ...]], Float32]
 """Function that returns a float32 array of a shape in main memory, which it keeps by name and reuses."""
 
 
-class ChunkSums:
-    """Sums of gradients of the chunks in a step's views. Between steps they are zero, as `adam` sets them to zero."""
+class GradientSums:
+    """Sums of the gradients of a step's views, on the device. Between steps they are zero: `adam` sets them to zero."""
 
     def __init__(self) -> None:
         self._held: DeviceGaussians | None = None
@@ -60,7 +60,7 @@ class BatchChunks:
 
     model: parameters, first and second moments, whole or streamed.
     numbers: numbers of the chunks, in rising order.
-    placed: these chunks, ready for Adam.
+    placed: list of these chunks for Adam.
     sums: sums of the views' gradients, with rows for the chunks of `numbers`, one chunk after the other.
     """
 
@@ -79,7 +79,7 @@ class BatchChunks:
         model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
         views: Sequence[ViewInputs],
         step: AdamStep,
-        sums: ChunkSums,
+        sums: GradientSums,
     ) -> BatchChunks | None:
         """Catch up the chunks that the views of Adam's step `step` may show. Returns None if the step runs over the
         whole model."""
@@ -143,8 +143,10 @@ class BatchChunks:
         shapes = {name: array.shape[1:] for name, array in model.arrays.items()}
         values = {name: room(name, (CHUNK_ROWS * len(whole) + rest, *shape)) for name, shape in shapes.items()}
         for start, stop, part, slots in self._whole_chunks(whole):
-            for name in PARAMETER_GROUPS:
-                _copy_out(self.work, part[name], slots, values[name][start:stop])
+            for name in PARAMETER_GROUPS:  # through the arrays of gradients, which no view uses yet
+                packed = self.work.array(f"view_{name}", (stop - start, *shapes[name]))
+                _pack(part[name], slots, packed)
+                packed.read_into(values[name][start:stop])
         for name in PARAMETER_GROUPS if rest else ():
             values[name][-rest:] = model[name].get_rows(model.count - rest, model.count)
         return values
@@ -166,10 +168,8 @@ def _in_view(inputs: ViewInputs) -> NDArray[np.uint32]:
     return inputs.chunks.in_view
 
 
-def _copy_out(work: Workspace, array: DeviceArray, chunks: DeviceArray, values: Float32) -> None:
-    """Copy listed chunks of an array to the host array `values`, one chunk after the other."""
-    if values.size:
+def _pack(array: DeviceArray, chunks: DeviceArray, packed: DeviceArray) -> None:
+    """Copy the listed chunks of `array` to the array `packed`, one chunk after the other."""
+    if packed.size:
         record = record_type({"values": array.shape[1:]})
-        packed = work.array("packed_chunks", values.shape)
         copy_chunks(array.device, chunks, packed, record, {"values": array}, to_records=True)
-        packed.read_into(values)

@@ -306,18 +306,21 @@ class MemoryPlanner:
         self._rasterizer.follow(made)
         self._photographs.follow(made.photographs)
         self._share_host(made, count)
-        self._plan_replicas = partial(self._follow_further, count, replace(memory, by_chunk=False, pool=None))
+        of = count, replace(memory, by_chunk=False, pool=None)
+        self._plan_replicas = partial(self._follow_further, *of, by_chunk=by_chunk and made.streamed)
         self._plan_replicas()
         return made
 
-    def _follow_further(self, count: int, memory: StepMemory) -> None:
+    def _follow_further(self, count: int, memory: StepMemory, *, by_chunk: bool) -> None:
         """Plan the memory of the further devices of a batch.
 
-        They get the rows in view, if their number is known; otherwise all `count` Gaussians must have a place, in
-        memory or streamed.
+        count: number of Gaussians of the model.
+        by_chunk: True if the first device streams the model by chunk. A further device then gets at most `rows_in_view`
+            rows, otherwise all Gaussians where a step runs over the whole model.
         """
         if self._batch is not None:
-            rows, devices = min(count, self.rows_in_view or count), [each.device for each in self._batch.replicas]
+            rows = min(count, self.rows_in_view or count) if by_chunk else count
+            devices = [each.device for each in self._batch.replicas]
             self._batch.follow([self._plan(each, rows, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in devices])
 
     def plan_view(self, current: Plan, chunks: int, of_step: int) -> Plan:
