@@ -174,7 +174,7 @@ def main(argv: Sequence[str]) -> int:
     config = settings(arguments.steps, arguments.degree, dense=arguments.dense)
     config = replace(config, view_order="near" if arguments.near else "random", batch=arguments.batch)
     if arguments.whole:
-        visible_chunks.ORDERED_ROWS = count  # no model of this tool has more rows
+        vars(visible_chunks)["ORDERED_ROWS"] = count  # no model of this tool has more rows
     with tempfile.TemporaryDirectory() as folder, MemoryPeak() as peak:
         write_scene(Path(folder), -(-count // CHUNK_ROWS), arguments.views, near=arguments.near)
         scene = replace(load_scene(Path(folder), test_every=0), unit=CELL)
