@@ -33,7 +33,7 @@ from clsplat.runs.run import Run
 from clsplat.runs.scratch import ScratchFiles, owner_of
 from clsplat.scenes.scene import Scene
 from clsplat.stages.density import gaussian_bytes
-from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
+from clsplat.training.batches.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import slot_fields

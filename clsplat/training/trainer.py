@@ -27,7 +27,7 @@ from clsplat.stages.density import DensityStatistics
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, download_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
-from clsplat.training.batch import Batch, Losses
+from clsplat.training.batches.batch import Batch, Losses
 from clsplat.training.cameras.refinement import Cameras, ValidationViews
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of

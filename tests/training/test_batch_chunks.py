@@ -25,7 +25,7 @@ from clsplat.gaussians import floats_of
 from clsplat.layouts.columns import CHUNK_ROWS, SPLAT
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import HostGaussians
-from clsplat.training.batch_chunks import BatchChunks
+from clsplat.training.batches.batch_chunks import BatchChunks
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.step import gradient_step, visible_chunks
 from clsplat.training.step.inputs import ViewInputs

@@ -39,9 +39,9 @@ from clsplat.stages.device_gaussians import (
 from clsplat.stages.loss import Loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
-from clsplat.training.batch_chunks import BatchChunks, GradientSums
+from clsplat.training.batches.batch_chunks import BatchChunks, GradientSums
+from clsplat.training.batches.replica import Replica, ViewOutcome, reused
 from clsplat.training.learning_rates import scaled, scaled_rates
-from clsplat.training.replica import Replica, ViewOutcome, reused
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, view_gradients
 from clsplat.training.step.inputs import PlacedChunks, StepRows, ViewInputs, ViewRows
 from clsplat.training.supervision.image_cache import ImageCache
