@@ -12,7 +12,8 @@
 //   contributions (n), with CONTRIBUTIONS: each Gaussian's blending weights, summed over all pixels.
 //   by_lens (n, 4), with LENS: each Gaussian's gradient with respect to the logs of the focal lengths and, per pixel,
 //     to the principal point.
-//   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians.
+//   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians. With CHUNKS
+//     (shared/chunks.h) they have the rows of the launch.
 //   With REGION (shared/region.h) visible Gaussians outside the region have gradients of zero.
 //   PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2), with the opacity o and the scales
 //     s_k.
@@ -86,12 +87,20 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
                            ,
                            __global float *by_lens
 #endif
-                               PENALTY_PARAMETERS REGION_PARAMETERS) {
+                               PENALTY_PARAMETERS CHUNK_PARAMETERS REGION_PARAMETERS) {
   const uint first_row = get_global_id(0) * LANES;
   if (first_row >= n) return;
+#ifdef CHUNKS
+  const long ahead = rows_ahead(chunks, first_row);
+  const uint end = end_of_rows(first_row, n, ahead, model_rows);
+  if (first_row >= end) return;
+  MOVE_ROWS(ahead, )
+#else
+  const uint end = n;
+#endif
   int shown[LANES];
   Gradients d;
-  if (!gradients_of(n, first_row, coefficients, camera, tile_counts, first_slots, slots, splats, means, quaternions,
+  if (!gradients_of(end, first_row, coefficients, camera, tile_counts, first_slots, slots, splats, means, quaternions,
                     log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
                     d_sh_rest + (size_t)3 * (coefficients - 1) * first_row, shown, &d PENALTY_WEIGHTS REGION_NUMBERS))
     return;

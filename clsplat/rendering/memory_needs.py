@@ -40,6 +40,7 @@ class StepMemory:
     by_chunk: True if a step may run over the chunks in view.
     pool: bytes for parameters and moments of the Gaussians on the device; None lets the plan choose.
     in_view: largest number of rows in the chunks that one view shows, as far as known.
+    in_step: the same for all views of a step of several views.
     """
 
     fields: SlotFields
@@ -51,6 +52,7 @@ class StepMemory:
     by_chunk: bool = False
     pool: int | None = None
     in_view: int = 0
+    in_step: int = 0
 
 
 def plan_frame(
@@ -132,15 +134,19 @@ def step_need(
         held=0 if step.by_chunk else None,  # bounds and lists of chunks take no device memory: they are in main memory
         pool=step.pool,
         in_view=step.in_view,
+        in_step=step.in_step,
+        gradients=frame.model if step.by_chunk and models > MODELS else 0,
     )
 
 
-def plan_view(device: Device, previous: Plan, in_view: int) -> Plan:
-    """Plan steps over the chunks in view again, with memory for views of up to `in_view` rows. Raises CapacityError.
+def plan_view(device: Device, previous: Plan, in_view: int, in_step: int) -> Plan:
+    """Plan steps over the chunks in view again, with memory for views of up to `in_view` rows, and for steps of up to
+    `in_step` rows. Raises CapacityError.
 
     previous: the last plan of these steps.
     """
-    return plan_by_chunk(replace(previous.need, in_view=in_view), previous.allowed, device.max_allocation)
+    need = replace(previous.need, in_view=in_view, in_step=in_step)
+    return plan_by_chunk(need, previous.allowed, device.max_allocation)
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:

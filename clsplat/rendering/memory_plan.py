@@ -41,6 +41,9 @@ class Need:
     pool: bytes for parameters, moments and statistics of the Gaussians on the device; None lets the plan choose.
     in_view: largest number of rows in the chunks that one view shows, as far as known; 0 unless steps run over the
         chunks in view.
+    in_step: the same for all views of a step of several views.
+    gradients: bytes per Gaussian of a view's gradients, and of their sums, in steps of several views over the chunks in
+        view. Twice as many are in `model`.
     """
 
     gaussians: int
@@ -57,6 +60,8 @@ class Need:
     held: int | None = None
     pool: int | None = None
     in_view: int = 0
+    in_step: int = 0
+    gradients: int = 0
 
     @property
     def pairs(self) -> int:
@@ -71,7 +76,7 @@ class Need:
     @property
     def record(self) -> int:
         """Bytes of a Gaussian in a chunk's record: parameters, moments and statistics."""
-        return self.model + self.statistics
+        return self.model - 2 * self.gradients + self.statistics
 
     @property
     def moving(self) -> int:
@@ -168,8 +173,8 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
 
 def _too_little(need: Need, least: int, budget: int) -> CapacityError:
-    in_view = min(need.in_view, need.gaussians)
-    shown = f", with {in_view:,} of them in chunks that one view shows," if in_view else ""
+    in_view = min(max(need.in_view, need.in_step), need.gaussians)
+    shown = f", with {in_view:,} of them in chunks that a step shows," if in_view else ""
     return CapacityError(
         f"{need.gaussians:,} Gaussians at this size of image{shown} need at least about {_rounded_up(least)} of device "
         f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow more "
@@ -187,18 +192,19 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     """Plan steps over the chunks in view. Raises CapacityError if not even one chunk fits.
 
     The arrays with a row for each Gaussian in view have memory for as many rows as the pool, or for `need.in_view` rows
-    if these are more.
+    if these are more. In steps of several views, sums of gradients have at least `need.in_step` rows.
 
     budget, max_allocation: as for `plan`.
     """
     assert need.held is not None, "steps over the chunks in view"
     room = budget - need.planes - need.scratch - need.gaussians * need.held - CHUNK_ROWS * need.record
-    by_slot = CHUNK_ROWS * (need.record + need.record // CROSSING_SHARE)
+    by_slot = CHUNK_ROWS * (need.record + need.record // CROSSING_SHARE + need.gradients)
     by_row = need.row - need.statistics - need.held + need.banded
 
     def without_pairs(slots: int) -> int:
         """Bytes of a pool of `slots` slots and of the arrays with a row for each Gaussian in view, without pairs."""
-        return slots * by_slot + max(CHUNK_ROWS * listed_chunks(slots), need.in_view) * by_row
+        rows, sums = (max(CHUNK_ROWS * listed_chunks(slots), shown) for shown in (need.in_view, need.in_step))
+        return slots * by_slot + rows * by_row + sums * need.gradients
 
     def wanted(slots: int) -> int:
         """Bytes of `without_pairs` and of arrays of pairs. There is at least one pair for each row in view, as one tile

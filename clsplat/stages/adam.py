@@ -19,6 +19,7 @@ from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import READBACK
+from clsplat.stages.chunk_lists import ChunkList
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 
@@ -63,10 +64,13 @@ def adam(
     second: DeviceGaussians,
     tile_counts: DeviceArray | None = None,
     readback: DeviceArray | None = None,
+    chunks: ChunkList | None = None,
 ) -> None:
     """Update the parameters by Adam, and set the gradients to zero.
 
+    gradients: gradients of all rows, or of the rows of `chunks`.
     first, second: Adam's moments.
+    chunks: the chunks of the model that the step updates; None for the whole model. Not with `OptimiserConfig.late`.
     tile_counts: (n,) uint32, 0 for a Gaussian that the view does not show; needed if `OptimiserConfig.late` is set.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the elements that were not updated, by reason
     (`columns.REFUSED`). None discards these counts.
@@ -82,17 +86,28 @@ def adam(
         rate, root = step.corrected(group)
         constants = (rate, root, beta1, beta2, epsilon, about.limit**2, counts)
         arrays = (parameters[group], gradients[group], first[group], second[group])
-        size, rows = parameters[group].size, parameters.count
+        size, rows = gradients[group].size, gradients.count
         if size == 0:
             continue
         if config.late:
             assert tile_counts is not None, "optimiser.late needs the tile counts of a view"
+            assert chunks is None, "optimiser.late steps over the whole model"
             kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
             launch_items(device, kernel, -(-rows // abreast), rows, *constants, tile_counts, *arrays)
         else:
-            kernel = device.kernels("adam", {"SPARSE": True} if config.sparse else {}).adam
+            defines: dict[str, object] = {"SPARSE": True} if config.sparse else {}
+            if chunks is not None:
+                defines |= {"WIDTH": size // rows, "CHUNKS": True}
+            kernel = device.kernels("adam", defines).adam
             # With 95 million Gaussians or more, an index of an SH coefficient needs more than 32 bits.
-            launch_items(device, kernel, -(-size // abreast), np.uint64(size), *constants, *arrays)
+            numbers = (np.uint64(size), *constants)
+            launch_items(device, kernel, -(-size // abreast), *numbers, *arrays, *_listed(chunks))
+
+
+def _listed(chunks: ChunkList | None) -> tuple[object, ...]:
+    """Arguments CHUNK_PARAMETERS of kernels/shared/chunks.h, with a plain buffer, because the profile assumes that a
+    kernel updates the arrays at the end of its arguments. Empty without chunks."""
+    return () if chunks is None else (chunks.numbers.buffer, chunks.model_rows)
 
 
 @stage("adam", add_view=1)
@@ -103,15 +118,18 @@ def add_view(
     sums: DeviceGaussians,
     *,
     sh_rest: bool = True,
+    places: ChunkList | None = None,
 ) -> None:
     """Add the gradients of the Gaussians visible in a view to the sums over the earlier views.
 
     tile_counts: (n,) uint32, tile counts in the view; 0 for a Gaussian that is not visible.
     sh_rest: also add the gradients of the higher SH bands.
+    places: for each chunk of the view its place among the chunks of `sums`; None if `sums` has the rows of the view.
     """
     rows = tile_counts.shape[0]
     for group in PARAMETER_GROUPS:
-        size = sums[group].size
-        if size and (sh_rest or group != "sh_rest"):
-            kernel = device.kernels("adam", {"WIDTH": size // rows}).add_view
-            launch_items(device, kernel, size, np.uint64(size), tile_counts, gradients[group], sums[group])
+        width = sums[group].size // sums.count
+        if width and (sh_rest or group != "sh_rest"):
+            defines: dict[str, object] = {"WIDTH": width, **({} if places is None else {"CHUNKS": True})}
+            kernel, arrays = device.kernels("adam", defines).add_view, (tile_counts, gradients[group], sums[group])
+            launch_items(device, kernel, rows * width, np.uint64(rows * width), *arrays, *_listed(places))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.chunks.division import listed_chunks
+from clsplat.chunks.division import chunks_of, listed_chunks
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 
@@ -44,9 +44,13 @@ class ChunkList:
         return self.numbers, self.model_rows
 
 
-def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Pad chunk numbers (k,) with NO_CHUNK to one of a few lengths, so that arrays and command buffers are reused."""
-    padded = np.full(listed_chunks(len(numbers)), NO_CHUNK, np.uint32)
+def padded_chunks(numbers: NDArray[np.uint32], most: int | None = None) -> NDArray[np.uint32]:
+    """Pad chunk numbers (k,) with NO_CHUNK to one of a few lengths, so that arrays and command buffers are reused.
+
+    most: maximum length, at least k; None for no maximum.
+    """
+    length = listed_chunks(len(numbers))
+    padded = np.full(length if most is None else min(length, most), NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
     return padded
 
@@ -60,7 +64,7 @@ def send_chunks(
 ) -> ChunkList:
     """Upload a padded list of chunks to the workspace's array `name`, and the chunks' first rows, if given, to another
     array, without waiting for the device."""
-    padded = padded_chunks(numbers)
+    padded = padded_chunks(numbers, max(chunks_of(model_rows), 1))
     array, first = work.array(name, padded.shape, np.uint32), None
     array.send(padded)
     if first_rows is not None:

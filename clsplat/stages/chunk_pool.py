@@ -68,8 +68,8 @@ class ChunkPool:
     arrays: arrays on the device by field, with CHUNK_ROWS rows for each slot.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
     cull: function that returns the chunks that a camera may show; None if no such function is available.
-    before_view: function that is called with the number of chunks of a step's view, before these are fetched. It may
-        resize the pool.
+    before_view: function that is called before a step with two numbers of chunks: the most that a view of the step
+        shows, and those that all its views show. It may resize the pool.
     """
 
     def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:
@@ -77,7 +77,7 @@ class ChunkPool:
         self._caught = np.zeros(store.chunks, np.uint32)
         """(chunks,), the value of `caught` of each chunk that is not on the device."""
         self.cull = cull
-        self.before_view: Callable[[int], None] = lambda _: None
+        self.before_view: Callable[[int, int], None] = lambda _chunks, _of_step: None
         self.moved_bytes = 0
         """Bytes of all records that have crossed the bus so far, in both directions."""
         self._moved_before = 0

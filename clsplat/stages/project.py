@@ -239,13 +239,15 @@ def project_grad(
     principal point in pixels, for a camera with an image plane.
     region: the region in which Gaussians get gradients, in the coordinates of the means; None for everywhere. Visible
     Gaussians outside it get zeros.
+
+    If only some chunks of `gaussians` were projected, the gradients have the rows of `projected`.
     """
     in_region, bounds = region_build(region)
     weights, build = explore.weights, _build(device)
-    defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
+    defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines, **projected.chunk_defines}
     defines |= {"PENALTIES": True} if weights else {}
     defines |= in_region | ({} if by_lens is None else {"LENS": True})
-    n = gaussians.count
+    n = projected.tile_counts.shape[0]
     launch_items(
         device,
         device.kernels("project_grad", defines).project_grad,
@@ -257,6 +259,7 @@ def project_grad(
         *([screen.contributions] if slots.fields.contributions else []),
         *([] if by_lens is None else [by_lens]),
         *weights,
+        *projected.chunk_arguments,
         *bounds,
     )
 

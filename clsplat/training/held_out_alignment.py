@@ -27,7 +27,7 @@ ALIGNMENT_STEPS, ALIGNMENT_REACH_DEGREES = 40, 1.0
 class _FixedModel(GradientStep):
     """Step of one view that changes only the view's parts, not the model."""
 
-    def update(self, rows: StepRows) -> None:
+    def update(self, rows: StepRows, inputs: ViewInputs) -> None:
         """Leave the rows unchanged."""
 
 

@@ -38,7 +38,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.analysis import sanity_checks
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
-from clsplat.training.batch import Losses
+from clsplat.training.batches.batch import Losses
 from clsplat.training.cameras.export import doubt_poses
 from clsplat.training.held_out_alignment import aligned
 from clsplat.training.preparation import late_settings

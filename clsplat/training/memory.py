@@ -6,13 +6,18 @@ If memory runs out, `TrainingSession.rescue` in `training/loop.py` writes a chec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
+import numpy as np
+
 from clsplat.camera import Camera
-from clsplat.chunks.division import listed_chunks
+from clsplat.chunks.bounds import ChunkBounds
+from clsplat.chunks.bounds_table import BoundsTable
+from clsplat.chunks.culling import PictureBorders, visible
+from clsplat.chunks.division import chunks_of, listed_chunks
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.checks import parse_bytes
 from clsplat.config.masks import NO_MASKS
@@ -28,11 +33,16 @@ from clsplat.runs.run import Run
 from clsplat.runs.scratch import ScratchFiles, owner_of
 from clsplat.scenes.scene import Scene
 from clsplat.stages.density import gaussian_bytes
-from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
+from clsplat.training.batches.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import slot_fields
-from clsplat.training.step.visible_chunks import most_in_view, settings_of_whole_steps, streams_by_chunk
+from clsplat.training.step.visible_chunks import (
+    MOST_MISSED_STEPS,
+    STEPS_PER_MEASUREMENT,
+    settings_of_whole_steps,
+    streams_by_chunk,
+)
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
@@ -212,6 +222,16 @@ def _least_pool(record: int) -> int:
     return -(-CHUNK_ROWS * record * 4 // POOL_QUARTERS)
 
 
+def most_in_view(gaussians: Gaussians, cameras: Iterable[Camera], config: TrainConfig) -> int:
+    """Return the largest number of chunks that one camera may show. gaussians: a model in the order of its chunks."""
+    bounds, still = ChunkBounds.measured(gaussians.means, gaussians.log_scales), np.zeros((2, 1))
+    table, updates = BoundsTable(len(bounds)), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT
+    measured = np.hstack([bounds.lowest, bounds.highest, bounds.largest[:, None]])
+    table.measure(np.arange(len(bounds), dtype=np.uint32), measured.astype(np.float32))
+    pictures = (PictureBorders.of(camera, config.rasterizer, 1.0) for camera in cameras)
+    return max(len(table.seen(partial(visible, each), lambda _: still, still, updates)) for each in pictures)
+
+
 UNLIMITED = HostMemory()
 """Main memory with no limit, no cache and no scratch files."""
 
@@ -221,6 +241,7 @@ class MemoryPlanner:
 
     begins: True until the first step. Until then too little main memory is an error, afterwards a warning.
     rows_in_view: largest number of rows in the chunks of one view so far, if the model is streamed by chunk.
+    rows_in_step: the same for all views of a step.
     """
 
     def __init__(
@@ -234,21 +255,25 @@ class MemoryPlanner:
     ) -> None:
         self._scene, self._config, self._rasterizer = scene, config, rasterizer
         self._photographs, self._memory, self._batch = photographs, memory, batch
-        self.begins, self._warned, self.rows_in_view = True, False, 0
+        self.begins, self._warned, self.rows_in_view, self.rows_in_step = True, False, 0, 0
+        self._plan_replicas: Callable[[], None] = lambda: None
+        """Function that plans the memory of a batch's further devices, for the latest number of Gaussians."""
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
         """Set `rows_in_view` to the largest number of rows in the chunks of the initial model that one view may show.
 
-        Only an even sample of the views is counted. The number is 0 if device memory has no limit, or if a model of
-        this size is never streamed by chunk.
+        Only an even sample of the views is counted. `rows_in_step` counts as if views had no chunk in common. Both are
+        0 if device memory has no limit, or if a model of this size is never streamed by chunk.
         local: function that converts a camera from world to model coordinates.
         initial: the model at the start, in the order of its chunks.
         """
         device, views = self._rasterizer.device, self._scene.views
-        self.rows_in_view = 0
+        self.rows_in_view = self.rows_in_step = 0
         if device.memory.limit is not None and streams_by_chunk(self._config, device, len(initial)):
             cameras = [local(view.camera) for view in views[:: -(-len(views) // MOST_VIEWS_LOOKED_AT)]]
-            self.rows_in_view = CHUNK_ROWS * most_in_view(initial, cameras, self._config)
+            chunks = most_in_view(initial, cameras, self._config)
+            self.rows_in_view = CHUNK_ROWS * chunks
+            self.rows_in_step = CHUNK_ROWS * min(chunks * self._config.batch, chunks_of(len(initial)))
 
     def plan(self, count: int, needs: StatisticsNeeds, components: Sequence[Component], turns: int) -> Plan:
         """Plan the memory for `count` Gaussians with their final number of SH coefficients.
@@ -273,6 +298,7 @@ class MemoryPlanner:
             if by_chunk and on_host
             else None,
             in_view=self.rows_in_view,
+            in_step=self.rows_in_step,
         )
         models = max(component.models for component in components)
         usual = MODELS if self._batch is None else OWNER_ARRAYS_PER_PARAMETER
@@ -280,27 +306,42 @@ class MemoryPlanner:
         self._rasterizer.follow(made)
         self._photographs.follow(made.photographs)
         self._share_host(made, count)
-        if self._batch is not None:
-            replicas = [replica.device for replica in self._batch.replicas]
-            self._batch.follow([self._plan(each, count, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in replicas])
+        of = count, replace(memory, by_chunk=False, pool=None)
+        self._plan_replicas = partial(self._follow_further, *of, by_chunk=by_chunk and made.streamed)
+        self._plan_replicas()
         return made
 
-    def plan_view(self, current: Plan, chunks: int) -> Plan:
-        """Plan the device's memory for views that show up to `chunks` chunks.
+    def _follow_further(self, count: int, memory: StepMemory, *, by_chunk: bool) -> None:
+        """Plan the memory of the further devices of a batch.
 
-        current: the current plan of a model that is streamed by chunk. It is returned if it has room for `chunks`
+        count: number of Gaussians of the model.
+        by_chunk: True if the first device streams the model by chunk. A further device then gets at most `rows_in_view`
+            rows, otherwise all Gaussians where a step runs over the whole model.
+        """
+        if self._batch is not None:
+            rows = min(count, self.rows_in_view or count) if by_chunk else count
+            devices = [each.device for each in self._batch.replicas]
+            self._batch.follow([self._plan(each, rows, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in devices])
+
+    def plan_view(self, current: Plan, chunks: int, of_step: int) -> Plan:
+        """Plan the device's memory for views that show up to `chunks` chunks, and steps that show up to `of_step`.
+
+        current: the current plan of a model that is streamed by chunk. It is returned if it has room for so many
             chunks, or if memory was planned for as many before. After a CapacityError it stays valid.
         """
-        device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
-        if rows <= max(self.rows_in_view, current.rows):
+        shown, known = (chunks, of_step), (self.rows_in_view, self.rows_in_step)
+        if all(CHUNK_ROWS * each <= max(rows, current.rows) for each, rows in zip(shown, known, strict=True)):
             return current
+        plan = partial(plan_view, self._rasterizer.device, current)
         try:  # plan for a few more chunks, so that slightly larger views need no new plan
-            padded = CHUNK_ROWS * listed_chunks(chunks)
-            wider, rows = plan_view(device, current, padded), padded
+            planned = [max(CHUNK_ROWS * listed_chunks(each), rows) for each, rows in zip(shown, known, strict=True)]
+            wider = plan(*planned)
         except CapacityError:
-            wider = plan_view(device, current, rows)
-        self.rows_in_view = rows
+            planned = [max(CHUNK_ROWS * each, rows) for each, rows in zip(shown, known, strict=True)]
+            wider = plan(*planned)
+        self.rows_in_view, self.rows_in_step = planned
         self._rasterizer.follow(wider)
+        self._plan_replicas()
         self._share_host(wider, wider.need.gaussians)
         return wider
 

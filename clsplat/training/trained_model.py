@@ -81,7 +81,7 @@ class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
     make_plan: function that plans the device's memory for a number of Gaussians.
-    plan_view: function from the current plan and a view's number of chunks to the plan for this view
+    plan_view: function from the current plan, and the numbers of chunks of a view and of a step, to the plan for them
         (`MemoryPlanner.plan_view`).
     scratch: function from bytes of chunks to the path of a new scratch file, or None to keep them in main memory.
     files: the training's scratch files; None if there is no folder for them.
@@ -100,7 +100,7 @@ class TrainedModel:
         device: Device,
         work: Workspace,
         make_plan: Callable[[int], Plan],
-        plan_view: Callable[[Plan, int], Plan],
+        plan_view: Callable[[Plan, int, int], Plan],
         scratch: Callable[[int], Path | None],
         files: ScratchFiles | None,
         *,
@@ -406,12 +406,12 @@ class TrainedModel:
         self.parameters, self.first, self.second = pooled(pool, coefficients)
         self.statistics = pooled_statistics(pool)
 
-    def _before_view(self, chunks: int) -> None:
+    def _before_view(self, chunks: int, of_step: int) -> None:
         """Plan the memory for a step whose view shows `chunks` chunks. Make the pool smaller if the view's arrays need
         some of its memory. No bit of a result depends on the pool's size. Raises CapacityError, before any change, and
         WriteError."""
         assert self._pool is not None
-        self.plan = self._plan_view(self.plan, chunks)
+        self.plan = self._plan_view(self.plan, chunks, of_step)
         if self.plan.rows < self._pool.rows:
             self._pool.resize(self.plan.rows)
             self.parameters, self.first, self.second = pooled(self._pool, self.parameters.coefficients)

@@ -27,7 +27,7 @@ from clsplat.stages.density import DensityStatistics
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, download_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
-from clsplat.training.batch import Batch, Losses
+from clsplat.training.batches.batch import Batch, Losses
 from clsplat.training.cameras.refinement import Cameras, ValidationViews
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
@@ -116,7 +116,7 @@ class Trainer:
         self.loader = ViewLoader(self.config, self.views, self.photographs, self.sizes, self.cameras.of, self.local)
         cameras = [self.local(view.camera) for view in self.views]
         others = (self.config, self.rasterizer, (self.appearance, self.cameras, self.depths))
-        of_model = (len(initial), self.scene.length_unit, partial(self.loader.next_camera, self.position))
+        of_model = (len(initial), self.scene.length_unit, partial(self.loader.next_cameras, self.position))
         self.components = components_of(*others, cameras, self.region, *of_model)
         self._active = [component for component in self.components if component.on]
         of, files = (self.device, self.rasterizer.work), (self.planner.scratch_file, self.planner.scratch_files)

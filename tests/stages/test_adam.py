@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""adam.cl: sums of views, steps that are left out, and elements that are refused."""
+"""adam.cl: sums of views, steps that are left out, elements that are refused, and steps over listed chunks."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import assert_close
+from compare import assert_close, assert_same_arrays
+from numpy.typing import NDArray
 from quick import quick
 
+from clsplat.arrays import Float32
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
-from clsplat.layouts.columns import READBACK, REFUSED
+from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK, READBACK, REFUSED
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.selftest.case import fresh_readback
-from clsplat.selftest.cases.steps import ADAM_CASE, uploaded_groups
+from clsplat.selftest.cases.steps import ADAM_CASE, ADAM_RATES, uploaded_groups
 from clsplat.stages.adam import AdamStep, adam, add_view
-from clsplat.stages.device_gaussians import allocate_gaussians
+from clsplat.stages.chunk_lists import ChunkList
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 
 
 @pytest.mark.parametrize("count", quick([1, 7, 8, 9, 63, 64, 65], 1, 9, 65))
@@ -111,3 +114,64 @@ def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: 
             for each in PARAMETER_GROUPS:
                 # A neighbour in the vector is worked out as a scalar, whose root a driver may round otherwise.
                 assert_close(values[each], wanted[kind][each], relative=1e-6)
+
+
+LISTS: dict[int, list[list[int]]] = {
+    1: [[0]],
+    CHUNK_ROWS - 1: [[0]],
+    CHUNK_ROWS: [[0]],
+    CHUNK_ROWS + 1: [[0], [1], [0, 1]],
+    3 * CHUNK_ROWS + 129: [[1], [3], [0, 2, 3], [0, 1, 2, 3]],
+}
+"""Lists of chunks by the number of rows of the model. The last chunk is full, has one row, or lacks one."""
+
+
+def _some_rows(model: DeviceGaussians, rows: NDArray[np.int64]) -> dict[str, Float32]:
+    return {group: model[group].get()[rows] for group in PARAMETER_GROUPS}
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("count", quick(LISTS, 1, 3 * CHUNK_ROWS + 129))
+def test_listed_chunks_take_the_step_alone(shaped_device: Device, count: int, sparse: bool) -> None:
+    """Their rows get the bits of a step over the whole model, and other rows stay. The list has padding."""
+    rng, step = np.random.default_rng(count), AdamStep(OptimiserConfig(sparse=sparse), 5, ADAM_RATES)
+    arrays = ADAM_CASE.random(rng, count).arrays
+    for values in arrays["gradients"].values():
+        values[rng.random(count) < 0.5] = 0
+    whole = uploaded_groups(shaped_device, arrays)
+    adam(shaped_device, step, *whole)
+    for numbers in LISTS[count]:
+        listed = ChunkList(upload(shaped_device, np.array([*numbers, NO_CHUNK], np.uint32)), count)
+        rows = np.flatnonzero(np.isin(np.arange(count) // CHUNK_ROWS, numbers))
+        model = uploaded_groups(shaped_device, arrays)
+        gradients = allocate_gaussians(shaped_device, listed.rows, model[1].coefficients, zero=True)
+        for group, values in arrays["gradients"].items():
+            gradients[group].set_rows(0, values[rows])
+        parameters, _, *moments = model
+        adam(shaped_device, step, parameters, gradients, *moments, chunks=listed)
+        others = np.setdiff1d(np.arange(count), rows)
+        for got, wanted, kind in zip(model, whole, arrays, strict=True):
+            if kind == "gradients":
+                assert not any(gradients[group].get().any() for group in PARAMETER_GROUPS)
+                continue
+            assert_same_arrays(_some_rows(got, rows), _some_rows(wanted, rows))
+            assert_same_arrays(_some_rows(got, others), {g: v[others] for g, v in arrays[kind].items()})
+
+
+def test_views_of_chunks_are_added_at_their_places(shaped_device: Device) -> None:
+    """A view of chunks 2 and 5 in a step over 2, 3 and 5. The second launch has a part of the rows, and padding."""
+    rng, view, chunks = np.random.default_rng(3), np.array([0, 2]), 3
+    sums = allocate_gaussians(shaped_device, chunks * CHUNK_ROWS, 4, zero=True)
+    wanted = {group: np.zeros(sums[group].shape, np.float32) for group in PARAMETER_GROUPS}
+    for rows, places in ((2 * CHUNK_ROWS, view), (CHUNK_ROWS + 700, view), (2 * CHUNK_ROWS, [2, NO_CHUNK])):
+        counts = rng.integers(0, 3, rows).astype(np.uint32)
+        counts[CHUNK_ROWS:] *= places[-1] != NO_CHUNK
+        gradients = allocate_gaussians(shaped_device, rows, 4)
+        to = (np.repeat(CHUNK_ROWS * np.array(places), CHUNK_ROWS) + np.tile(np.arange(CHUNK_ROWS), 2))[:rows]
+        for group, shape in group_shapes(rows, 4).items():
+            values = rng.standard_normal(shape).astype(np.float32)
+            gradients[group].set(values)
+            wanted[group][to[counts > 0]] += values[counts > 0]
+        listed = ChunkList(upload(shaped_device, np.array(places, np.uint32)), sums.count)
+        add_view(shaped_device, upload(shaped_device, counts), gradients, sums, places=listed)
+    assert_same_arrays({group: sums[group].get() for group in PARAMETER_GROUPS}, wanted)

@@ -29,8 +29,10 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_gaussians import allocate_gaussians
-from clsplat.training import batch
-from clsplat.training.batch import Batch, Replica, ViewOutcome, scaled, scaled_rates, shares
+from clsplat.training.batches import batch
+from clsplat.training.batches.batch import Batch, shares
+from clsplat.training.batches.replica import Replica, ViewOutcome
+from clsplat.training.learning_rates import scaled, scaled_rates
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields
 from clsplat.training.step.inputs import StepRows
 from clsplat.training.trainer import Trainer

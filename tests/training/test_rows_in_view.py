@@ -92,7 +92,7 @@ def test_the_pool_shrinks_before_a_view_of_more_chunks(
     before = slots_of(trainer)
     run_steps(7, trainer)
     assert trainer.planner.rows_in_view == CHUNK_ROWS * listed_chunks(IN_VIEW)
-    trainer.model._before_view(IN_VIEW + 4)  # as if a later view showed more
+    trainer.model._before_view(IN_VIEW + 4, IN_VIEW + 4)  # as if a later view showed more
     run_steps(STEPS - 7, trainer)
     assert len(sizes) > 1
     assert [before, *sizes] == sorted({before, *sizes}, reverse=True), "each time it is smaller"
@@ -104,7 +104,7 @@ def test_the_pool_shrinks_before_a_view_of_more_chunks(
 
 def least_of(error: CapacityError) -> int:
     """The least memory that a refusal names."""
-    named = re.search(r"(\d+) of them in chunks that one view shows, need at least about ([\d.,]+ \w+)", str(error))
+    named = re.search(r"(\d+) of them in chunks that a step shows, need at least about ([\d.,]+ \w+)", str(error))
     assert named is not None, error
     least = parse_bytes(re.sub("[ ,]", "", named[2]))
     assert least is not None

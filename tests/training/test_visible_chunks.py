@@ -459,13 +459,13 @@ def test_a_strategy_that_looks_at_each_step(scene: Scene, default_device: Device
 @pytest.mark.parametrize(
     "config",
     [
-        replace(CONFIG, batch=2),
+        replace(CONFIG, batch=2, thinning=0.3),
         replace(CONFIG, antialiased=True),
         replace(CONFIG, refine_poses=True),
         replace(CONFIG, optimiser=OptimiserConfig(late=True)),
         short(iterations=40, report=False, density={"growth": "mcmc", "max_gaussians": 9000}),
     ],
-    ids=["batch", "antialiased", "poses", "late", "mcmc"],
+    ids=["batch with thinning", "antialiased", "poses", "late", "mcmc"],
 )
 def test_other_steps_take_the_whole_model(
     scene: Scene, default_device: Device, shares: list[float], config: TrainConfig

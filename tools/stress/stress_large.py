@@ -2,13 +2,16 @@
 """Train a model that is larger than the memory it may have, and say what its steps take.
 
     tools/stress/run large [--gaussians 20e6] [--degree 3] [--steps 300] [--max-host-mem 4GiB] [--max-device-mem SIZE]
-        [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE] [--json] [--control SHARE]
+        [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE,...] [--batch N] [--whole] [--json]
+        [--control SHARE]
 
 The model is a plain of cells, each with a chunk of Gaussians that are made from a seed. Each camera looks at a small
 part of the plain. Prints the time of a step, the bytes that a step moves, and the peak of anonymous and shared memory.
-Also prints a digest of parameters and moments after the last step, which is the same at every limit. With --control,
-density control follows: in a share of the chunks it clones some Gaussians and removes others. Then its time, its peak,
-and the bytes that this process reads and writes for it (Linux) are printed too.
+Also prints a digest of parameters and moments after the last step, which is the same at every limit. With --batch, a
+step has several views, which several devices share, and the bytes of Gaussians that a step moves between devices are
+printed too. With --whole, each step runs over the whole model. With --control, density control follows: in a share of
+the chunks it clones some Gaussians and removes others. Then its time, its peak, and the bytes that this process reads
+and writes for it (Linux) are printed too.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from typing_extensions import Self
 from clsplat.chunks.gathering import SourceList
 from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
-from clsplat.device.selection import open_device
+from clsplat.device.selection import open_devices
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
@@ -43,6 +46,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import HostArray, HostGaussians
 from clsplat.training.density import RowPlan
 from clsplat.training.memory import UNLIMITED, HostMemory
+from clsplat.training.step import visible_chunks
 from clsplat.training.trainer import Trainer
 
 DIGEST_ROWS = 1 << 18
@@ -84,8 +88,9 @@ def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int,
     """A trainer whose model is the plain. arguments: the command line's. count: number of Gaussians."""
     limit = parse_bytes(arguments.max_host_mem, "--max-host-mem")
     memory = UNLIMITED if limit is None else HostMemory(limit=limit, scratch=scratch, owner="large")
-    device = open_device(arguments.device, memory_limit=parse_bytes(arguments.max_device_mem, "--max-device-mem"))
-    trainer = Trainer(scene, config, device, memory=memory)
+    on_device = parse_bytes(arguments.max_device_mem, "--max-device-mem")
+    device, *further = open_devices(arguments.device, memory_limit=on_device)
+    trainer = Trainer(scene, config, device, further=further, memory=memory)
     shapes = group_shapes(count, (config.sh_degree + 1) ** 2)
     arrays: Any = {group: SeededArray(group, shape) for group, shape in shapes.items()}
     model = trainer.model
@@ -160,12 +165,16 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--dense", action="store_true")
     parser.add_argument("--near", action="store_true")
     parser.add_argument("--device")
+    parser.add_argument("--batch", type=int, default=1)
+    parser.add_argument("--whole", action="store_true")
     parser.add_argument("--control", type=float, metavar="SHARE")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(argv)
     count = int(arguments.gaussians)
     config = settings(arguments.steps, arguments.degree, dense=arguments.dense)
-    config = replace(config, view_order="near" if arguments.near else "random")
+    config = replace(config, view_order="near" if arguments.near else "random", batch=arguments.batch)
+    if arguments.whole:
+        vars(visible_chunks)["ORDERED_ROWS"] = count  # no model of this tool has more rows
     with tempfile.TemporaryDirectory() as folder, MemoryPeak() as peak:
         write_scene(Path(folder), -(-count // CHUNK_ROWS), arguments.views, near=arguments.near)
         scene = replace(load_scene(Path(folder), test_every=0), unit=CELL)
@@ -175,18 +184,20 @@ def main(argv: Sequence[str]) -> int:
         begin = time.perf_counter()
         trainer.catch_up()
         caught, moved = time.perf_counter() - begin, trainer.model.moved_bytes
+        between = 0 if trainer.batch is None else trainer.batch.moved_bytes
         text = digest(trainer)
         controlled = control(trainer, arguments.control) if arguments.control is not None else ""
         text += f", {digest(trainer)} after density control" if controlled else ""
         trainer.close()
     if arguments.json:
-        print(json.dumps({**times, "peak": peak.bytes, "digest": text}))
+        print(json.dumps({**times, "peak": peak.bytes, "digest": text, "between_devices": between / arguments.steps}))
         return 0
     print(
         f"{count:,} Gaussians of degree {arguments.degree}, {'dense' if arguments.dense else 'sparse'} Adam, "
         f"{arguments.steps} steps: {times['median_ms']:.2f} ms a step (median), {times['mean_ms']:.2f} (mean), "
         f"{times['processor_ms']:.0f} of all threads (median), "
-        f"{moved / arguments.steps / 2**20:.0f} MiB moved a step, {made:.0f} s to begin, {caught:.0f} s to catch up, "
+        f"{moved / arguments.steps / 2**20:.0f} MiB moved a step, {between / arguments.steps / 2**20:.0f} MiB between "
+        f"devices, {made:.0f} s to begin, {caught:.0f} s to catch up, "
         f"peak {peak.bytes / 2**20:,.0f} MiB, digest {text}"
     )
     if controlled:

@@ -120,6 +120,7 @@ def cases(model: int, first: str, others: Sequence[str]) -> list[Case]:
         Case("two parts", pair, parts),
         Case("two parts at half their memory", pair, (*parts, "--max-device-mem", half)),
         Case("two parts at the least", pair, parts, least=True),
+        Case("two parts killed", pair, parts, killed=True),
     ]
     for device in others:
         whole, on = f"device {device}", ("--device", device)

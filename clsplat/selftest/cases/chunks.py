@@ -26,7 +26,7 @@ from clsplat.selftest.cases.density import STATISTICS_CASE
 from clsplat.selftest.cases.steps import ADAM_CASE, ADAM_ENDS, ADAM_RATES, random_scene, uploaded_groups
 from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.adam import AdamStep
+from clsplat.stages.adam import AdamStep, adam, add_view
 from clsplat.stages.bounds import bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkList, padded_chunks
@@ -102,6 +102,7 @@ BOUNDS_CASE = Case(
 
 
 MOMENTS = ("first", "second")
+STATE = ("parameters", *MOMENTS)
 CURRENT = ("current_totals", "current_largest")
 """Names of the two statistics of contributions (sum and maximum over views) that the tested view updates."""
 BEGIN = 0.5
@@ -194,6 +195,7 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     screen = Screen(upload(device, np.zeros((chunks.rows, 2), np.float32)), by_row)
     view = (camera_array, some, _slots(device, some, given.slots[rows]), screen)
     step = AdamStep(OptimiserConfig(sparse=given.sparse), STEP, ADAM_RATES)
+    read_batch = _launch_batch(device, given, chunks, view, step)
     model = (held, *uploaded_groups(device, given.moments))
     project_step(device, step, model, *view, fresh_readback(device))
     statistics = new_statistics(device, held.count, contributions=True)
@@ -207,8 +209,30 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
         "counts": counts[: len(rows)],
         "counts past the model": past,
         "splats": some.splats.get()[: len(rows)],
+        **read_batch(),
         **read_whole(),
     }
+
+
+def _launch_batch(
+    device: Device,
+    given: Inputs,
+    chunks: ChunkList,
+    view: tuple[DeviceArray, Projected, Slots, Screen],
+    step: AdamStep,
+) -> Read:
+    """Take the step with kernels of a step of several views: gradients of the listed chunks, their sums, then Adam."""
+    model = (upload_gaussians(device, given.gaussians), *uploaded_groups(device, given.moments))
+    parameters, *moments = model
+    gradients, sums = (allocate_gaussians(device, chunks.rows, parameters.coefficients, zero=True) for _ in range(2))
+    camera_array, projected, slots, screen = view
+    project_grad(device, parameters, camera_array, projected, slots, gradients, screen)
+    places = np.arange(chunks.numbers.shape[0], dtype=np.uint32)
+    in_sums = ChunkList(upload(device, places[::-1].copy()), sums.count)  # another order than that of the view
+    add_view(device, projected.tile_counts, gradients, sums, places=in_sums)
+    listed = ChunkList(upload(device, chunks.numbers.get()[::-1].copy()), chunks.model_rows)
+    adam(device, step, parameters, sums, *moments, chunks=listed)
+    return lambda: {f"batch {name}": _flat(each) for name, each in zip(STATE, model, strict=True)}
 
 
 def _launch_whole(device: Device, given: Inputs, held: DeviceGaussians, camera_array: DeviceArray) -> Read:
@@ -261,7 +285,10 @@ def _twin_of_adam(given: Inputs, got: Arrays, listed: NDArray[np.bool_]) -> dict
     rows = "sparse" if given.sparse else "late"
     step = Inputs(arrays=arrays, rows=rows, step=STEP, visible=listed, rates=ADAM_RATES)
     got["gradients"] = np.zeros(0)  # project_step keeps no gradients in memory
-    return dict(ADAM_CASE.twin(step, got))
+    of_batch = {name: got[f"batch {name}"] for name in STATE} | {"gradients": np.zeros(0)}
+    wanted = {f"batch {name}": each for name, each in ADAM_CASE.twin(step, of_batch).items()}
+    got |= {f"batch {name}": each for name, each in of_batch.items()}
+    return wanted | ADAM_CASE.twin(step, got)
 
 
 CHUNKS_CASE = Case(
@@ -272,9 +299,6 @@ CHUNKS_CASE = Case(
     frozen=_frozen_steps,
     digested=("parameters", *MOMENTS, "gradient_sums", "seen", "radii", "current_totals", "current_largest"),
 )
-
-
-STATE = ("parameters", "first", "second")
 
 
 def _random_missed(rng: Generator, count: int) -> Inputs:

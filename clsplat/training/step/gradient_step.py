@@ -130,7 +130,7 @@ class GradientStep:
         sent = place(camera, inputs.background)
         source = on_device(self.rasterizer.work, inputs.photograph)
         terms = loss_terms(self.config, inputs)
-        placed = None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
+        placed = self.place(model, inputs)
         model, chunks = (model, None) if placed is None else (placed.model, placed.in_model)
         key = self._key(inputs, source, terms, chunks)
         gradient = partial(self._gradient, model[0], inputs, sent, source, terms, chunks)
@@ -147,6 +147,10 @@ class GradientStep:
         self._change(model, inputs, frame, slots, gradients, probe, placed)
         self.learn(inputs, own)
         return result
+
+    def place(self, model: tuple[AnyGaussians, ...], inputs: ViewInputs) -> PlacedChunks | None:
+        """Make the chunks that the step runs over ready. Returns None if the step runs over all rows of `model`."""
+        return None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
 
     def _gradient(
         self,
@@ -344,7 +348,7 @@ class GradientStep:
         """Take Adam's step for some rows, after the changes that the view's parts make to them."""
         for part in inputs.parts:
             part.before_adam(rows, self.adam_step)
-        self.update(rows)
+        self.update(rows, inputs)
 
     def replayed(
         self,
@@ -369,7 +373,7 @@ class GradientStep:
         for part, gradient in zip(inputs.parts, own, strict=True):
             part.update(gradient, self.rasterizer.readback)
 
-    def update(self, rows: StepRows) -> None:
+    def update(self, rows: StepRows, inputs: ViewInputs) -> None:  # noqa: ARG002
         """Take Adam's step for some rows. Before it, compute the gradient of projection, unless `rows` has it."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
@@ -386,12 +390,16 @@ StepMaker = Callable[..., GradientStep]
 """Function that makes a `GradientStep` from its arguments `turn` and `room`."""
 
 
-def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
+def view_gradients(
+    work: Workspace, parameters: AnyGaussians, rows: int | None = None, *, zero: bool = False
+) -> DeviceGaussians:
     """Arrays for a view's gradients of the rows that are on the device at the same time.
 
+    rows: number of these rows, if the step runs over some chunks; None for the rows of the whole model.
     zero: True to fill the arrays with zeros, as `GradientStep.run` requires.
     """
-    rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
+    if rows is None:
+        rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
     shapes = group_shapes(rows, parameters.coefficients)
     arrays = {group: work.array(f"view_{group}", shape) for group, shape in shapes.items()}
     for array in arrays.values() if zero else ():

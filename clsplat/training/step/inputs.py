@@ -36,9 +36,24 @@ class PlacedChunks:
 class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
+    @property
+    def numbers(self) -> NDArray[np.uint32]:
+        """Numbers of the chunks that any view of the step may show, in rising order."""
+
+    @property
+    def in_view(self) -> NDArray[np.uint32]:
+        """Numbers of the chunks that this view may show, in rising order."""
+
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks of `model` (parameters, first and second moments) ready for Adam's step `step`. Returns None
-        if the step runs over the whole model instead."""
+        """Make all chunks of the step ready for Adam's step `step`. Call it once in a step. Returns None if the step
+        runs over the whole model instead.
+
+        model: parameters, first and second moments.
+        """
+
+    def place(self, model: tuple[AnyGaussians, ...]) -> PlacedChunks:
+        """Send the list of this view's chunks to the device, after `prepare`. For a streamed model, bring the chunks to
+        the pool."""
 
 
 @dataclass(eq=False)

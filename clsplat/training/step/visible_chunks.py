@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from math import isfinite
@@ -23,7 +23,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
-from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
@@ -32,9 +32,9 @@ from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
-from clsplat.training.learning_rates import largest_rates
+from clsplat.training.learning_rates import largest_rates, scaled, scaled_rates
 from clsplat.training.step.component import Component, Named
-from clsplat.training.step.inputs import ChunksInView, PlacedChunks, ViewInputs
+from clsplat.training.step.inputs import PlacedChunks, ViewInputs
 
 STEPS_PER_MEASUREMENT = 16
 """Number of steps after which the bounds of the chunks that took part in them are measured again. With more steps,
@@ -61,7 +61,7 @@ def settings_of_whole_steps(config: TrainConfig) -> list[str]:
         "--density.growth mcmc": config.density.growth == "mcmc",
         "--antialiased": config.antialiased,
         "--optimiser.late": config.optimiser.late,
-        "--batch": config.batch > 1,
+        "--batch with --thinning": config.batch > 1 and config.thinning > 0,
         "--refine-poses": config.refine_poses,
         "--refine-lenses": config.refine_lenses,
     }
@@ -76,16 +76,6 @@ def runs_by_chunk(config: TrainConfig, device: Device) -> bool:
 def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
     """True if a model of `count` Gaussians may be streamed by chunks."""
     return count > ORDERED_ROWS and runs_by_chunk(config, device)
-
-
-def most_in_view(gaussians: Gaussians, cameras: Iterable[Camera], config: TrainConfig) -> int:
-    """Return the largest number of chunks that one camera may show. gaussians: a model in the order of its chunks."""
-    bounds, still = ChunkBounds.measured(gaussians.means, gaussians.log_scales), np.zeros((2, 1))
-    table, updates = BoundsTable(len(bounds)), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT
-    measured = np.hstack([bounds.lowest, bounds.highest, bounds.largest[:, None]])
-    table.measure(np.arange(len(bounds), dtype=np.uint32), measured.astype(np.float32))
-    pictures = (PictureBorders.of(camera, config.rasterizer, 1.0) for camera in cameras)
-    return max(len(table.seen(partial(visible, each), lambda _: still, still, updates)) for each in pictures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +105,7 @@ class VisibleChunks(Component):
 
     unit: the scene's length unit.
     count: number of Gaussians.
-    next_camera: function that returns the camera of the next step's view; None if it is not known yet.
+    next_cameras: function that returns the cameras of the next step's views, as far as they are known.
     """
 
     def __init__(
@@ -124,19 +114,20 @@ class VisibleChunks(Component):
         rasterizer: Rasterizer,
         unit: float,
         count: int,
-        next_camera: Callable[[], Camera | None],
+        next_cameras: Callable[[], Sequence[Camera]],
     ) -> None:
-        self._config, self._rasterizer, self._unit, self._next_camera = config, rasterizer, unit, next_camera
+        self._config, self._rasterizer, self._unit, self._next_cameras = config, rasterizer, unit, next_cameras
+        self._optimiser = scaled(config.optimiser, config.batch)
         self._borders = lru_cache(_KEPT_BORDERS)(PictureBorders.of)
         self._ahead: dict[tuple[Camera, int, BoundsTable], NDArray[np.uint32]] = {}
-        """Chunks that the next step's view may show, by its camera, the step's number and the bounds."""
-        self._limit_movement(largest_step(config.optimiser))
+        """Chunks that a view of the next step may show, by its camera, the step's number and the bounds."""
+        self._limit_movement(largest_step(self._optimiser))
         self._begin(count, 0)
 
     def _limit_movement(self, limit: float) -> None:
         """Set the limit of a parameter's movement in one step of Adam, as a multiple of the learning rate."""
         self._step_limit = limit
-        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, limit)
+        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._optimiser, limit)
 
     def _begin(self, count: int, step: int, chunks: int = 0) -> None:
         """Forget all bounds. The model has `count` Gaussians, and all have taken step number `step`.
@@ -224,40 +215,49 @@ class VisibleChunks(Component):
         return bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """Return the step's only view, with the chunks that it may show.
+        """Return the step's views, each with the chunks that it may show.
 
-        step, count: number of the step, and number of Gaussians.
+        step: number of the step's last view.
+        count: number of Gaussians.
         """
         if count <= ORDERED_ROWS or self._since is None:
             return inputs
-        (of_view,) = inputs
+        step = self._number(step)
         if self.step < step - 1:  # earlier steps ran over all rows, as the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
-        numbers = self._ahead.get((of_view.camera, step, self._found))
-        if numbers is None:
-            numbers = self._shown(of_view.camera, step, hidden, most_hidden)
+        by_view = []
+        for each in inputs:
+            found = self._ahead.get((each.camera, step, self._found))
+            by_view.append(self._shown(each.camera, step, hidden, most_hidden) if found is None else found)
+        numbers = by_view[0] if len(by_view) == 1 else np.unique(np.concatenate(by_view))
         if self._before_view is not None:
-            self._before_view(len(numbers))
-        whole = self._before_view is None and len(numbers) > MAX_SHARE_IN_VIEW * len(self._last)
+            self._before_view(max(map(len, by_view)), len(numbers))
+        whole = self._before_view is None and sum(map(len, by_view)) > MAX_SHARE_IN_VIEW * len(self._last) * len(inputs)
         self._since += 1
         if whole:
             numbers = np.arange(len(self._last), dtype=np.uint32)
         self._note_movement(numbers, hidden(numbers))
         self._found.move(numbers, self._step_limit * self._mean_and_scale_rates(range(step, step + 1)))
         missed = self._missed(numbers, step - 1)
-        return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
+        of_step = _ChunksInView(self, numbers, numbers, missed, self._found, whole=whole)
+        return [
+            replace(each, chunks=of_step if len(inputs) == 1 else replace(of_step, in_view=found))
+            for each, found in zip(inputs, by_view, strict=True)
+        ]
 
     def after_adam(self, gaussians: AnyGaussians) -> None:  # noqa: ARG002
-        """Find the chunks that the next step's view may show, while the device still computes the step just launched.
+        """Find the chunks that the next step's views may show, while the device still computes the step just launched.
 
         Before the next step, limits of movement may shrink and bounds may be measured. The chunks found here may then
         be more than that step needs, which changes no bit of its result.
         """
-        camera, step = self._next_camera(), self.step + 1
+        cameras, step = self._next_cameras(), self.step + 1
         self._ahead.clear()
-        if camera is not None and self._count > ORDERED_ROWS and self._since is not None:
-            self._ahead[camera, step, self._found] = self._shown(camera, step, *self._hidden_movement(step))
+        if cameras and self._count > ORDERED_ROWS and self._since is not None:
+            hidden = self._hidden_movement(step)
+            for camera in cameras:
+                self._ahead[camera, step, self._found] = self._shown(camera, step, *hidden)
 
     def in_view(self, camera: Camera) -> NDArray[np.uint32]:
         """Numbers of the chunks that a camera may show after the last step."""
@@ -297,8 +297,14 @@ class VisibleChunks(Component):
 
     def _mean_and_scale_rates(self, steps: range) -> Float64:
         """Upper limits (2, 1) of the learning rates of means and log scales in the steps with the numbers `steps`."""
-        rates = largest_rates(self._config, steps, self._unit)
+        batch = self._config.batch
+        views = range((steps[0] - 1) * batch + 1, steps[-1] * batch + 1)
+        rates = scaled_rates(largest_rates(self._config, views, self._unit), batch)
         return np.array([[rates["means"]], [rates["log_scales"]]])
+
+    def _number(self, views: int) -> int:
+        """Return Adam's number of the step that the training's view number `views` is in."""
+        return -(-views // self._config.batch)
 
     def _note_movement(self, chunks: NDArray[np.uint32], hidden: Float64) -> None:
         """Widen the bounds of the chunks by `hidden` (2, n), the limit of their movement in missed steps."""
@@ -321,7 +327,7 @@ class VisibleChunks(Component):
         if chunks.of_rows is not self._found:  # rows have moved since, after all chunks were caught up
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
-            chunks = _ChunksInView(self, everything, None, self._found, whole=True)
+            chunks = _ChunksInView(self, everything, everything, None, self._found, whole=True)
         if chunks.missed is not None:
             self._catch_up(model, chunks.missed)
         older = {number: last for number, last in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
@@ -329,15 +335,20 @@ class VisibleChunks(Component):
         self._last, self.step = self._last.copy(), step.number
         self._last[chunks.numbers] = step.number
         self._note(step)
+        return None if chunks.whole and _pool_of(model) is None else self.place(model, chunks.numbers, "of_step")
+
+    def place(self, model: tuple[AnyGaussians, ...], numbers: NDArray[np.uint32], name: str) -> PlacedChunks:
+        """Send the list of the chunks `numbers` to the device. For a streamed model, bring the chunks to the pool.
+
+        name: part of the names of the lists' arrays. A list is valid until the next one with its name.
+        """
         work, pool = self._rasterizer.work, _pool_of(model)
-        if chunks.whole and pool is None:
-            return None
-        if pool is not None and len(chunks.numbers) > pool.slots:
-            return PlacedChunks(model, ChunkNumbers(chunks.numbers))
         if pool is None:
-            return PlacedChunks(model, send_chunks(work, "chunks", chunks.numbers, model[0].count))
-        first_rows = pool.store.starts[chunks.numbers] if self._config.thinning > 0 else None
-        slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows, first_rows)
+            return PlacedChunks(model, send_chunks(work, f"chunks_{name}", numbers, model[0].count))
+        if len(numbers) > pool.slots:
+            return PlacedChunks(model, ChunkNumbers(numbers))
+        first_rows = pool.store.starts[numbers] if self._config.thinning > 0 else None
+        slots = send_chunks(work, f"slots_{name}", pool.place(numbers, changes=True), pool.rows, first_rows)
         return PlacedChunks(_in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
@@ -391,11 +402,12 @@ class VisibleChunks(Component):
         padded = np.full(on_device.shape, step, np.uint32)
         padded[: len(last)] = last
         on_device.send(padded)
-        catch_up(device, self._config.optimiser, model, chunks, on_device, caught, step, table, readback)
+        catch_up(device, self._optimiser, model, chunks, on_device, caught, step, table, readback)
 
     def step_back(self, step: int) -> None:
-        """Return to the state after step number `step`. Chunks that have been caught up since then are not caught up
-        twice: the device knows the step of each."""
+        """Return to the state after the step that ended with view number `step`. Chunks that have been caught up since
+        then are not caught up twice: the device knows the step of each."""
+        step = self._number(step)
         if step >= self.step:
             return
         self._last, self.step = self._before[step + 1], step
@@ -420,7 +432,7 @@ class VisibleChunks(Component):
         self._begin(listed.shape[0], self.step)
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Continue from a checkpoint of `count` Gaussians after `step` steps, without bounds. Its moments may come from
+        """Continue from a checkpoint of `count` Gaussians after `step` views, without bounds. Its moments may come from
         other decay rates, so they are read for the limit of a parameter's movement in one step.
 
         named: function from a prefix to the checkpoint's arrays whose names have this prefix.
@@ -433,8 +445,8 @@ class VisibleChunks(Component):
                 with np.errstate(divide="ignore", invalid="ignore"):
                     each = np.abs(first[group][rows]) / np.sqrt(second[group][rows])
                 ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN is 0 / 0: no gradient yet
-        self._limit_movement(largest_resumed_step(self._config.optimiser, ratio, step))
-        self._begin(count, step)
+        self._limit_movement(largest_resumed_step(self._optimiser, ratio, self._number(step)))
+        self._begin(count, self._number(step))
 
     @property
     def row_bytes(self) -> int:
@@ -444,10 +456,12 @@ class VisibleChunks(Component):
 
 
 @dataclass(frozen=True, eq=False)
-class _ChunksInView(ChunksInView):
+class _ChunksInView:
     """The chunks of a step's view, and the steps that some of them have missed.
 
     of: the component that made this object.
+    numbers: chunks that any view of the step may show.
+    in_view: chunks that this view may show.
     of_rows: the bounds from which the chunks were chosen. When rows move, the component makes new bounds, which shows
         that the list of chunks is outdated.
     whole: True if the step runs over the whole model; `numbers` then lists all its chunks.
@@ -455,13 +469,18 @@ class _ChunksInView(ChunksInView):
 
     of: VisibleChunks
     numbers: NDArray[np.uint32]
+    in_view: NDArray[np.uint32]
     missed: Missed | None
     of_rows: BoundsTable
     whole: bool
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Catch up these chunks, and send their list to the device."""
+        """Catch up the chunks of the step, and send their list to the device."""
         return self.of.prepare(model, step, self)
+
+    def place(self, model: tuple[AnyGaussians, ...]) -> PlacedChunks:
+        """Send the list of this view's chunks to the device."""
+        return self.of.place(model, self.in_view, "of_view")
 
 
 def _pool_of(model: Sequence[AnyGaussians]) -> ChunkPool | None:

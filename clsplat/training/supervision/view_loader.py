@@ -51,14 +51,14 @@ class ViewLoader:
             self._cameras[view] = now, camera
         return camera
 
-    def next_camera(self, position: Position) -> Camera | None:
-        """Camera of the next step's view, the object that `inputs` will give it.
+    def next_cameras(self, position: Position) -> list[Camera]:
+        """Cameras of the next step's views, the objects that `inputs` will give them, as far as they are known.
 
-        It is another object if the photographs' size or the refined camera changes before that step. None if an epoch
-        begins with the next view, or if this is the first epoch, in which sizes are not known yet.
+        They are other objects if the photographs' size or a refined camera changes before that step. Views of the next
+        epoch are not known yet, and neither are cameras in the first epoch, because sizes are not known.
         """
-        _, camera = self._cameras.get(position.queue[-1], (None, None)) if position.queue else (None, None)
-        return camera
+        views = position.queue[: -1 - self._config.batch : -1]
+        return [self._cameras[view][1] for view in views if view in self._cameras]
 
     def inputs(self, view: int, position: Position, place: int, *, begins: bool) -> ViewInputs:
         """Inputs of a view, at the size of the current step.
