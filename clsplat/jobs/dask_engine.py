@@ -154,6 +154,11 @@ class DaskEngine:
         gpus = {address: info.get("resources", {}).get(GPU_RESOURCE, 0) >= 1 for address, info in infos.items()}
         self._workers = {address: gpu for address, gpu in gpus.items() if gpu or not any(gpus.values())}
         self._looked_at = now
+        if self._workers and not self._sent and self._left_out.issuperset(self._workers):
+            raise ClsplatError(
+                f"--scheduler {self._scheduler}: has no workers but those that are left out; the same command goes on "
+                "with others, or when that is mended"
+            )
 
     def _outcome(self, sent: _Sent) -> Outcome:
         """Read the outcome of an attempt that has ended on its worker, or whose worker Dask has given up."""

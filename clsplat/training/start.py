@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Start`: a model that a training begins with, and what else the training takes from an earlier one."""
+"""`Start`: the model and the region that a training begins with, and their checks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from clsplat.runs.checkpoints import Checkpoint
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What a training begins with, in place of Gaussians from the scene's points.
+    """Start of a training from a model, in place of Gaussians from the scene's points.
 
     model: the initial Gaussians. None makes them from the scene's points.
     region: the region in which the training changes Gaussians. None means everywhere.

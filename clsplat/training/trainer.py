@@ -29,7 +29,6 @@ from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
 from clsplat.training.cameras.refinement import Cameras, ValidationViews
-from clsplat.training.components import components_of
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
@@ -39,6 +38,7 @@ from clsplat.training.preparation import is_along_rays, saved_model
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.start import Start, check_region, region_state
+from clsplat.training.step.components import components_of
 from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
 from clsplat.training.step.monitor import StepMonitor

@@ -32,7 +32,15 @@ from clsplat.viewer.appearance import (
 )
 from clsplat.viewer.measure import MAX_LENGTH_METRES, Measurement, point_at
 from clsplat.viewer.path_recorder import add_key, path_document, save_path
-from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS, MAX_PAGE_SIDE_PX, Pose, Start, fitted, leaning, wide_enough
+from clsplat.viewer.pose import (
+    MAX_PAGE_PICTURE_PIXELS,
+    MAX_PAGE_SIDE_PX,
+    OpeningView,
+    Pose,
+    fitted,
+    leaning,
+    wide_enough,
+)
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -65,7 +73,7 @@ class World:
     """
 
     title: str
-    start: Start
+    start: OpeningView
     origin: Float64
     box: tuple[Float64, Float64]
     degree: int

@@ -101,7 +101,7 @@ def read_pose(
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class OpeningView:
     """Camera of a newly opened page: position, orbit centre (`target`) and up direction in the world.
 
     fov, aspect: vertical field of view in radians, and width / height, of a picture that must be visible as a whole.
@@ -132,7 +132,7 @@ def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
     return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), MAX_START_FOV_Y_RADIANS)) if more > 1 else fov
 
 
-def start_of(cameras: Sequence[Camera], points: Float64, *, level: bool = False) -> Start:
+def start_of(cameras: Sequence[Camera], points: Float64, *, level: bool = False) -> OpeningView:
     """Choose the viewer's start: the pose of the first camera that is not an outlier.
 
     The orbit centre is in front of this camera, at the depth of the point that all cameras look at.
@@ -151,13 +151,13 @@ def start_of(cameras: Sequence[Camera], points: Float64, *, level: bool = False)
         if not distance > 1e-6 * away:
             distance = away or 1.0
         if not first.is_pinhole:
-            return Start(first.position, first.position + distance * ahead, up, DEFAULT_FOV_Y_RADIANS)
+            return OpeningView(first.position, first.position + distance * ahead, up, DEFAULT_FOV_Y_RADIANS)
         fov, aspect = 2 * math.atan2(0.5 * first.height, first.fy), (first.width / first.fx) / (first.height / first.fy)
-        return Start(first.position, first.position + distance * ahead, up, fov, aspect)
+        return OpeningView(first.position, first.position + distance * ahead, up, fov, aspect)
     low, high = extent_of(points)
     middle = 0.5 * (low + high)
     distance = 0.6 * float(np.linalg.norm(high - low)) / math.tan(DEFAULT_FOV_Y_RADIANS / 2) or 1.0
-    return Start(middle - [0.0, 0.0, distance], middle, np.array(COLMAP_UP), DEFAULT_FOV_Y_RADIANS)
+    return OpeningView(middle - [0.0, 0.0, distance], middle, np.array(COLMAP_UP), DEFAULT_FOV_Y_RADIANS)
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
@@ -173,7 +173,7 @@ def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
     return np.asarray(turn.apply(up / np.linalg.norm(up)))
 
 
-def looking(start: Start, size: tuple[int, int]) -> Pose:
+def looking(start: OpeningView, size: tuple[int, int]) -> Pose:
     """Return the camera's pose in a newly opened page. start: the first view; size: width and height in pixels."""
     rotation, _ = look_at(start.position, start.target, start.up)
     return Pose(rotation.T, start.position, start.fov_on(*size), *size)

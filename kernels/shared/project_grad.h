@@ -90,9 +90,13 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
     shown[lane] = count > 0;
 #ifdef REGION
+    trained[lane] = 0;
+#endif
+    if (count == 0) continue;
+#ifdef REGION
     const size_t at = first_row + lane;
-    trained[lane] = count > 0 && in_region(means + 3 * at REGION_NUMBERS);
-    if (count > 0 && !trained[lane]) {
+    trained[lane] = in_region(means + 3 * at REGION_NUMBERS);
+    if (!trained[lane]) {
       frozen = 1;
       for (int k = 0; k < 2; ++k) screen[2 * at + k] = 0.0f;
 #ifdef CONTRIBUTIONS
@@ -105,9 +109,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
       SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
       for (int k = 0; k < 3 * (SH_USED(coefficients) - 1); ++k) d_f[k] = 0.0f;
 #endif
+      continue;
     }
 #endif
-    if (!TRAINED[lane]) continue;
     any = 1;
 #ifdef ADDED_UP
     __global const float *slot = slots + (size_t)SLOT_STRIDE * (first_row + lane);

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import dispatching
@@ -191,6 +192,18 @@ def test_what_a_worker_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert found.kind == "unfit" and "expected 9.9 like the dispatcher" in found.reason
     assert dask_engine._attempts_here == {}
     dask_engine.end_on_worker(["unknown"])
+
+
+def test_the_last_good_worker_leaves() -> None:
+    """The workers that stay are left out, so that nothing would ever go on."""
+    workers: dict[str, dict[str, Any]] = {"tcp://a": {}, "tcp://b": {}}
+    client = SimpleNamespace(status="running", scheduler_info=lambda: {"workers": workers})
+    engine = dask_engine.DaskEngine(client, "tcp://s")
+    assert engine.free() == 2
+    assert engine.leave_out("tcp://a") and engine.free() == 1
+    del workers["tcp://b"]
+    engine._looked_at = float("-inf")
+    refuses("--scheduler tcp://s: has no workers but those that are left out", engine.free, error=ClsplatError)
 
 
 def test_a_command_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ that counts in FOLDER/NAME.count fails.
 from __future__ import annotations
 
 import argparse
-import fcntl
 import hashlib
 import os
 import sys
@@ -62,7 +61,10 @@ def main() -> int:
     (arguments.folder / f"{arguments.name}.pid").write_text(str(os.getpid()))
     path = arguments.folder / f"{arguments.name}.count"
     with path.open("a+") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if sys.platform != "win32":
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         file.seek(0)
         begun = file.read().count("\n")
         for step in range(begun, arguments.steps):

@@ -8,6 +8,7 @@ from math import inf
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from tiny import CONFIG
 
 from clsplat.api import train
@@ -85,7 +86,7 @@ def trains_on(device: Device, stops_at: int | None = None) -> TrainRun:
     return run_it
 
 
-def in_cell(model: Gaussians, rectangle: Rectangle) -> np.ndarray:
+def in_cell(model: Gaussians, rectangle: Rectangle) -> NDArray[np.bool_]:
     """Mask of the means in a rectangle on x and z."""
-    flat = model.means[:, [0, 2]]
-    return ((flat >= np.float32(rectangle.low)) & (flat < np.float32(rectangle.high))).all(axis=1)
+    flat, low, high = model.means[:, [0, 2]], np.array(rectangle.low, np.float32), np.array(rectangle.high, np.float32)
+    return np.asarray(((flat >= low) & (flat < high)).all(axis=1))

@@ -13,8 +13,8 @@ from tiny import CONFIG, run_steps
 from clsplat.device.context import Device
 from clsplat.reference.sampling import sampling_limits
 from clsplat.scenes.scene import Scene
-from clsplat.training import mip_filter
-from clsplat.training.mip_filter import MipFilter
+from clsplat.training.step import mip_filter
+from clsplat.training.step.mip_filter import MipFilter
 from clsplat.training.trainer import Trainer
 
 SMOOTH = replace(CONFIG, antialiased=True)

@@ -20,6 +20,7 @@ from wide import let_small_models_have_chunks, wide_model
 
 from clsplat.api import train
 from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.selection import open_device
 from clsplat.errors import ClsplatError, InputError
@@ -29,6 +30,7 @@ from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
+from clsplat.stages import region as region_stage
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.repro_bundle import read_bundle, replay, write_bundle
 from clsplat.training.stability.health import Incident
@@ -119,6 +121,17 @@ def test_far_from_the_origin_of_the_world() -> None:
     region = TrainedRegion(GROUND, origin[[0, 2]] - 0.05, origin[[0, 2]] + 0.05)
     means = np.array([[0.04, 1, 0], [0.06, 1, 0], [0, 1, -0.06]], np.float32)
     assert region.contains(means, origin).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("rows", [1, 7, 20, 40, 41])
+def test_rows_inside_are_found_piece_by_piece(
+    default_device: Device, monkeypatch: pytest.MonkeyPatch, rows: int
+) -> None:
+    monkeypatch.setattr(region_stage, "TESTED_ROWS", rows)
+    means = start_model().means
+    found = region_stage.rows_inside(upload(default_device, means), REGION)
+    assert found.tolist() == np.flatnonzero(REGION.contains(means)).tolist()
+    assert len(region_stage.rows_inside(upload(default_device, means[:0]), REGION)) == 0
 
 
 @pytest.mark.parametrize(

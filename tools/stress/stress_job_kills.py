@@ -36,8 +36,10 @@ STEP_SECONDS = 0.02
 """Seconds of a step."""
 STEPS_A_KILL = 60
 """Steps of all tasks together for each kill, so that work is left until the last kill."""
-CALM_SECONDS = 20.0
+CALM_SECONDS = 60.0
 """Seconds to wait at most for progress before a kill, so that most kills hit running tasks."""
+EARLY_SHARE, EARLY_SECONDS = 0.25, 6.0
+"""Share of kills that do not wait for progress, and the longest time after which they come."""
 KILL_SECONDS = 1.5
 """Longest time from progress to a kill."""
 RESULTS = ("*.count", "merged.ply", "model.ply", "blocks/*/model.ply")
@@ -114,7 +116,8 @@ class Killer:
     def kill(self) -> None:
         """Start what is missing, wait for progress or a random time, and kill a process with SIGKILL."""
         self._start()
-        before, until = self._size(), time.monotonic() + self.chance.uniform(0.0, CALM_SECONDS)
+        early = self.chance.uniform(0.0, EARLY_SECONDS) if self.chance.random() < EARLY_SHARE else CALM_SECONDS
+        before, until = self._size(), time.monotonic() + early
         while self._size() == before and time.monotonic() < until:
             time.sleep(0.02)
         time.sleep(self.chance.uniform(0.0, KILL_SECONDS))

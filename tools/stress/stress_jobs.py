@@ -10,7 +10,6 @@ dispatcher takes more than 500 MB or 5 ms a task.
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -57,6 +56,8 @@ class StubEngine:
 
 def main(argv: Sequence[str]) -> int:
     """Run the test, and print its result as JSON. Returns the exit status."""
+    import resource  # POSIX only
+
     parser = plain_parser(__doc__)
     parser.add_argument("--tasks", type=int, default=10_000, help="number of tasks, default 10000")
     parser.add_argument("--workers", type=int, default=64, help="number of workers, default 64")

@@ -10,10 +10,9 @@ from clsplat.selftest.cases.appearance import COLOUR_CASES
 from clsplat.selftest.cases.chunks import BOUNDS_CASE, CATCH_UP_CASE, CHUNK_RECORDS_CASE, CHUNKS_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
-from clsplat.selftest.cases.depth import of_depth
 from clsplat.selftest.cases.grid import GRID_CASE
 from clsplat.selftest.cases.library import HARMONICS_CASE, SPLATS_CASE, of_ewa, of_values
-from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
+from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE, of_depth
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.primitives import APPEND_CASE, BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE

@@ -9,9 +9,9 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.training.mip_filter import MipFilter
 from clsplat.training.step.component import Component
 from clsplat.training.step.late_adam import LateAdam
+from clsplat.training.step.mip_filter import MipFilter
 from clsplat.training.step.visible_chunks import VisibleChunks
 
 
