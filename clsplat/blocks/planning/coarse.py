@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import sqrt
 
 from clsplat.config.colour_models import appearance_rate_of_part
 from clsplat.config.presets import STEP_SETTINGS, stretched
@@ -22,13 +23,15 @@ def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
 
     config: settings of the training of the whole.
     longest: longest side of the photographs at the size of the whole, in pixels.
-    The schedule is shortened, with three exceptions. The time between densifications stays, because a densification
-    after a few steps would rate Gaussians by a few photographs. Opacities are never reset, because the resets would
-    come before all photographs have been seen since the last. Gains take steps as large as in the whole's training: a
+    The schedule is shortened, with three exceptions. The steps between densifications are multiplied only by the root
+    of the factor, which leaves about a quarter of the Gaussians of the whole, as half the size asks for. Opacities are
+    never reset, because there is no time to recover from it. Gains take steps as large as in the whole's training: a
     short training would take larger ones, too large for the few steps in which a photograph is shown.
     """
-    short = stretched(config, coarse_steps(config), [name for name in STEP_SETTINGS if name != "density.every"])
-    density = replace(short.density, opacity_reset_every=0)
+    steps = coarse_steps(config)
+    short = stretched(config, steps, [name for name in STEP_SETTINGS if name != "density.every"])
+    every = round(config.density.every * sqrt(steps / config.iterations))
+    density = replace(short.density, opacity_reset_every=0, every=max(every, 1) if config.density.every else 0)
     if density.fills:  # pictures of half the size show a quarter of the pixels
         density = replace(density, max_gaussians=max(round(COARSE_SIZE**2 * density.max_gaussians), 1))
     return replace(
