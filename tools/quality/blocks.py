@@ -324,7 +324,12 @@ def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str)
         "largest",
     )
     ground = ground_of(renderer, models_of(city)["finished"], scene.views, plan)
-    for kind, folder in (("of the coarse model", city), ("their own", other)):
+    kinds = {
+        "of the coarse model": city,
+        "their own": other,
+        "exposure without drift": given.folder / "cities" / "frozen",
+    }
+    for kind, folder in kinds.items():
         for name, model in models_of(folder).items():
             images = [renderer.render(model, view.camera).image for view in scene.views]
             across, along = (colour_steps(images, clean, ground, lines) for lines in (borders, beside))
