@@ -39,7 +39,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def run_attempt(attempt: Attempt, ended: threading.Event) -> Outcome:
-    """Run the task's command once in this process's folder. `ended`: event that ends the command when it is set."""
+    """Claim the task, and run its command once. ended: event that ends the command when it is set."""
     folder, host = Path(attempt.folder), socket.gethostname()
     if reason := unfit_reason(attempt):
         return Outcome(attempt.name, "unfit", reason=reason, worker=host)
@@ -134,9 +134,9 @@ def end_command(process: subprocess.Popen[bytes]) -> None:
 
 
 def _killed_with_parent() -> Callable[[], None] | None:
-    """On Linux, a function for a new process, which has the system kill it when its parent is killed.
+    """On Linux, a function that a new process calls, so that the system kills it when its parent is killed.
 
-    Elsewhere None: there a command goes on if this process is killed, until it ends by itself.
+    On other systems None: a command whose attempt is killed goes on there until it ends by itself.
     """
     if not sys.platform.startswith("linux"):
         return None

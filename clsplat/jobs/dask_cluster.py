@@ -19,6 +19,8 @@ SCHEDULER_TIMEOUT_SECONDS = 20
 """Seconds within which a scheduler has to answer."""
 NO_WORKERS_WARNING_SECONDS = 10.0
 """Seconds between warnings while a scheduler has no workers."""
+_LOGGING_PARTS = ("client", "comm", "core", "nanny", "scheduler", "utils", "worker")
+"""Parts of Dask with loggers of their own."""
 
 
 def dask_setup(_: Any) -> None:
@@ -43,7 +45,7 @@ def dask_client(scheduler: str | None, workers: int | None = None) -> Iterator[A
             f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
         ) from None
     # silence Dask, which logs every lost worker in many lines; errors that matter are raised
-    for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
+    for name in ("distributed", *(f"distributed.{part}" for part in _LOGGING_PARTS)):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler is not None:
         try:

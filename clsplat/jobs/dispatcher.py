@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clsplat.errors import ClsplatError, examples, warn
+from clsplat.files.atomic import ABANDONED_FILE_SECONDS
 from clsplat.files.locks import is_claimed
 from clsplat.jobs.task import (
     ATTEMPT_PREFIX,
@@ -44,9 +45,9 @@ PROGRESS_SECONDS = 1.0
 class JobProgress:
     """Progress of all tasks.
 
-    done, total: number of tasks that are done, and of all tasks.
-    steps, total_steps: number of steps of all tasks that are done, and that there are.
-    running: names of the tasks that run now, here or in other processes.
+    done, total: number of tasks that are done, and number of all tasks.
+    steps, total_steps: number of steps that are done, and number of all steps, summed over all tasks.
+    running: names of the tasks that run now, started by this dispatcher or by others.
     failed: number of tasks that have failed.
     """
 
@@ -68,12 +69,12 @@ def run_tasks(
 ) -> None:
     """Run the tasks that are not done.
 
-    folder: folder of claims and logs, which is made if it is missing. All workers must see it.
+    folder: folder for claims and logs. All workers must see it. It is created if it is missing.
     needs: files and folders that every worker must see, such as the scene.
 
-    A task fails after MAX_TRIES attempts without progress. Tasks that are not after it go on.
-    Raises ClsplatError at the end if tasks have failed, or if no worker is left. Raises KeyboardInterrupt, with advice
-    how to go on, when all processes have ended.
+    A task fails after MAX_TRIES attempts without progress. Tasks that do not depend on it go on.
+    Raises ClsplatError at the end if tasks have failed, and at once if no worker is left. After Ctrl-C, all commands
+    are ended first, and the message of the KeyboardInterrupt says how to go on.
     """
     check_tasks(tasks)
     folder = folder.absolute()
@@ -107,7 +108,7 @@ class _Dispatcher:
         self._running: set[str] = set()
         self._claimed: dict[str, float] = {}
         self._tries: dict[str, int] = {}
-        self._before: dict[str, int] = {}  # steps at the begin of the attempt that runs
+        self._before: dict[str, int] = {}  # steps when the running attempt began
         self._steps = {task.name: task.progress() for task in tasks}
         self._all_steps, self._total_steps = sum(self._steps.values()), sum(task.total for task in tasks)
         self._told_of_claim = False
@@ -136,7 +137,7 @@ class _Dispatcher:
         if not self.failed:
             return
         waiting = len(self.tasks) - self.done - len(self.failed)
-        more = f", and {waiting} that are after them were not begun" if waiting else ""
+        more = f", and {waiting} that depend on them were not begun" if waiting else ""
         logs = examples(log_path(self.folder, name) for name in self.failed)
         raise ClsplatError(
             f"{len(self.failed)} of {len(self.tasks)} tasks failed: {examples(self.failed)}{more}; see {logs}; the "
@@ -162,7 +163,7 @@ class _Dispatcher:
             self.engine.start(Attempt(name, task.command, str(self.folder), self.needs, self.mark))
 
     def _finish(self, name: str) -> None:
-        """Count a task as done, and make those ready that wait for it alone."""
+        """Count a task as done. Tasks that waited for this task alone become ready."""
         self.done += 1
         self._claimed.pop(name, None)
         self._see(name, self.tasks[name].total)
@@ -191,7 +192,7 @@ class _Dispatcher:
                 heapq.heappush(self._later, (time.monotonic() + RETRY_SECONDS, name))
 
     def _leave_out(self, outcome: Outcome) -> None:
-        """Use an unfit worker no more, and put its task at the front. Raises ClsplatError if no worker is left."""
+        """Use an unfit worker no more, and begin its task next. Raises ClsplatError if no worker is left."""
         self._ready.appendleft(outcome.name)
         if not self.engine.leave_out(outcome.worker):
             raise ClsplatError(
@@ -210,19 +211,23 @@ class _Dispatcher:
         line = last_line(log)
         end = f"; {log} ends with: {line}" if line and not line.startswith(ATTEMPT_PREFIX) else f"; see {log}"
         self.failed[outcome.name] = why
-        warn(f"{outcome.name} failed {MAX_TRIES} times without progress; {why}{end}")
+        warn(f"task {outcome.name} failed {MAX_TRIES} times without progress; {why}{end}")
 
     def _wait_for_claim(self, name: str) -> None:
-        """Look at the task again in CLAIM_CHECK_SECONDS, as another process is doing it."""
+        """Look again in CLAIM_CHECK_SECONDS at a task that another process has claimed."""
         now = time.monotonic()
         since = self._claimed.setdefault(name, now)
         if now - since > CLAIMED_WARNING_SECONDS and not self._told_of_claim:
             self._told_of_claim = True
-            warn(f"{name}: another process does it, or was killed on another machine; waiting for it")
+            minutes = ABANDONED_FILE_SECONDS / 60
+            warn(
+                f"task {name} is claimed by another process; waiting until that process has done it or has ended (on "
+                f"another machine, until its claim is {minutes:.0f} minutes old)"
+            )
         heapq.heappush(self._later, (now + CLAIM_CHECK_SECONDS, name))
 
     def _look(self) -> None:
-        """Read the progress of the tasks that run here or elsewhere."""
+        """Read the progress of the running tasks, also of those that other dispatchers have started."""
         for name in (*self._running, *self._claimed):
             self._see(name, self.tasks[name].progress())
 

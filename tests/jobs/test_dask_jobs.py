@@ -75,7 +75,7 @@ def test_workers_that_are_killed(tmp_path: Path, cluster: DaskProcesses, told: l
     assert sum(begun) == 5, "one task was begun again"
 
 
-def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses) -> None:
+def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses, capfd: pytest.CaptureFixture[str]) -> None:
     """One line; the commands end with their workers; the same tasks go on with a new scheduler."""
     tasks = [counting_task(tmp_path, str(number), 100, seconds=0.02) for number in range(2)]
     kills: list[str] = []
@@ -91,6 +91,7 @@ def test_a_scheduler_that_is_killed(tmp_path: Path, cluster: DaskProcesses) -> N
 
     message = "the scheduler was lost; what is done stays, and the same command goes on when a scheduler runs again"
     refuses(f"--scheduler {cluster.address}: {message}", run, error=ClsplatError)
+    assert "Traceback" not in capfd.readouterr().err
     pids = [int((tmp_path / f"{task.name}.pid").read_text()) for task in tasks]
     until = time.monotonic() + 60
     while any(map(alive, pids)) and time.monotonic() < until:

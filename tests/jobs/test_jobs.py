@@ -66,7 +66,7 @@ def test_three_tries_without_progress(tmp_path: Path, monkeypatch: pytest.Monkey
     bad = JobTask("bad", (sys.executable, "-c", "import sys; print('no good'); print(); sys.exit(4)"), lambda: False)
     tasks = [bad, counting_task(tmp_path, "after", 1, after=("bad",)), counting_task(tmp_path, "other", 2)]
     refuses(
-        "1 of 3 tasks failed: bad, and 1 that are after them were not begun; see ",
+        "1 of 3 tasks failed: bad, and 1 that depend on them were not begun; see ",
         run_tasks,
         tasks,
         LocalEngine(1),
@@ -74,7 +74,9 @@ def test_three_tries_without_progress(tmp_path: Path, monkeypatch: pytest.Monkey
         error=ClsplatError,
     )
     log = tmp_path / "jobs" / "bad.log"
-    assert told == [f"bad failed 3 times without progress; the command ended with status 4; {log} ends with: no good"]
+    assert told == [
+        f"task bad failed 3 times without progress; the command ended with status 4; {log} ends with: no good"
+    ]
     assert log.read_text().count("--- ") == 3
     assert counted(tmp_path, "other") == 2 and counted(tmp_path, "after") == 0
 
@@ -150,7 +152,7 @@ def test_a_task_of_another_process_is_waited_for(tmp_path: Path, monkeypatch: py
     run_tasks([task], LocalEngine(1), tmp_path / "jobs")
     assert other.stdin is not None
     other.stdin.close()
-    assert told == ["a: another process does it, or was killed on another machine; waiting for it"]
+    assert len(told) == 1 and told[0].startswith("task a is claimed by another process; waiting until that process")
     assert counted(tmp_path, "a") == 1
 
 

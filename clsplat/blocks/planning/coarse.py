@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from clsplat.config.colour_models import appearance_rate_of_part
 from clsplat.config.presets import STEP_SETTINGS, stretched
 from clsplat.config.training import TrainConfig
 
@@ -23,8 +24,10 @@ def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
 
     config: settings of the training of the whole.
     longest: longest side of the photographs at the size of the whole, in pixels.
-    The schedule is shortened, with two exceptions. The number of steps between densifications stays, unless there would
-    be fewer than MIN_DENSIFICATIONS. Opacities are never reset, because there is no time to recover from it.
+    The schedule is shortened, with three exceptions. The number of steps between densifications stays, unless there
+    would be fewer than MIN_DENSIFICATIONS. Opacities are never reset, because there is no time to recover from it.
+    Gains take steps as large as in the whole's training: a short training would take larger ones, too large for the few
+    steps in which a photograph is shown.
     """
     short = stretched(config, coarse_steps(config), [name for name in STEP_SETTINGS if name != "density.every"])
     span = short.density.stop - short.density.start
@@ -32,7 +35,15 @@ def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
     density = replace(short.density, opacity_reset_every=0, every=every)
     if density.fills:  # pictures of half the size show a quarter of the pixels
         density = replace(density, max_gaussians=max(round(COARSE_SIZE**2 * density.max_gaussians), 1))
-    return replace(short, resolution=max(round(COARSE_SIZE * longest), 1), eval_at=(), density=density)
+    return replace(
+        short,
+        resolution=max(round(COARSE_SIZE * longest), 1),
+        eval_at=(),
+        appearance_rate=appearance_rate_of_part(
+            config.appearance_rate, config.appearance, config.iterations, short.iterations
+        ),
+        density=density,
+    )
 
 
 def coarse_steps(config: TrainConfig) -> int:
