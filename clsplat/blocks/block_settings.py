@@ -7,13 +7,14 @@ from dataclasses import fields, replace
 from math import sqrt
 
 from clsplat.blocks.plan import Block, BlockPlan
+from clsplat.config.colour_models import appearance_rate_of_part
 from clsplat.config.depth import DEPTH_WEIGHT_END_FRACTION
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.training.learning_rates import means_rate_at
 
-FINISH_APPEARANCE_RATE = 0.03
-"""Learning rate of appearance in the finish, as a fraction of the setting. The finish begins with appearances that
-need small corrections only."""
+FINISH_APPEARANCE_RATE = 0.3
+"""Learning rate of appearance in the finish, as a fraction of that in a training of the whole. The finish begins with
+appearances that need small corrections only."""
 FINISH_COOLDOWN_TO = 0.2
 """Fraction of every learning rate that is left at the end of the finish."""
 
@@ -72,7 +73,8 @@ def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
         _without_events(whole, photographs=plan.photographs),
         iterations=steps,
         eval_at=tuple(step for step in whole.eval_at if step <= steps),
-        appearance_rate=whole.appearance_rate * FINISH_APPEARANCE_RATE,
+        appearance_rate=FINISH_APPEARANCE_RATE
+        * appearance_rate_of_part(whole.appearance_rate, whole.appearance, whole.iterations, steps),
         depth_weight=whole.depth_weight * DEPTH_WEIGHT_END_FRACTION,
         optimiser=replace(
             whole.optimiser,

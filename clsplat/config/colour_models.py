@@ -7,6 +7,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+FULL_LENGTH_STEPS = 10_000
+"""Number of steps below which a training counts as short. In a training of this length, at the learning rate of the
+settings, a gain can change by about 2 octaves."""
 GAIN_ENTRIES = 3
 """Number of gains of a photograph, one for each colour channel. They are the first values learnt for a photograph."""
 
@@ -54,3 +57,20 @@ COLOUR_MODELS = {
     )
 }
 """Colour models by value of the setting `appearance`. Each is a stage of the self-test."""
+
+
+def rise_in_short_training(steps: int) -> float:
+    """Factor on the learning rate of colour models in a training of `steps` steps, so that gains can change by as much
+    as in a long one."""
+    return max(FULL_LENGTH_STEPS / steps, 1.0)
+
+
+def appearance_rate_of_part(rate: float, kind: str, whole: int, part: int) -> float:
+    """Return the setting `appearance_rate` with which a training of `part` steps takes as large steps as one of `whole`
+    steps with `rate`: gains that moved as far in few steps would be random.
+
+    kind: the setting `appearance`.
+    """
+    if kind not in COLOUR_MODELS:  # only colour models have higher rates in short trainings
+        return rate
+    return rate * rise_in_short_training(whole) / rise_in_short_training(part)

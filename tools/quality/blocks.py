@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import shutil
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 from quality.trainings import Rows, call, trained, words_of
 
 from clsplat.arrays import Float32, Float64
@@ -37,6 +35,8 @@ BAND_METRES = 3.0
 """Width, on each side of a border, of the band in which PSNR and colours are measured, in world units of the town."""
 EXTRA_STEPS = 1.05
 """Steps of the whole's training, as a multiple of --iterations, because the finish adds about as many to the blocks."""
+BESIDE_METRES = 9.0
+"""Distance of lines, beside the borders, across which colours are compared too: they tell what is no border."""
 LEAST_PIXELS = 200
 """Least number of pixels of a view in the band, or elsewhere, that count."""
 OUTSIDE_CAMERAS = 8
@@ -45,29 +45,30 @@ TALLEST = 80.0
 """Height above the median point up to which Gaussians of a block are drawn from outside, in world units: no sky."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Border:
-    """Squared errors and colours of pixels in the band along the borders, and elsewhere."""
+    """A line on the ground between blocks: coordinate `at` on the axis `axis`, from `begin` to `end` on the other."""
 
-    plan: BlockPlan
-    band: float
+    axis: int
+    at: float
+    begin: float
+    end: float
 
     def distances(self, places: Float64) -> Float64:
-        """Distance (n,) of points on the ground (n, 2) from the nearest border."""
-        found = np.full(len(places), np.inf)
-        for block in self.plan.blocks:
-            low, high = np.array(block.cell.low), np.array(block.cell.high)
-            inside = ((places >= low) & (places < high)).all(axis=1)
-            edges = np.concatenate([places[inside] - low, high - places[inside]], axis=1)
-            found[inside] = edges.min(axis=1)
-        return found
+        """Signed distances (..., ) of points on the ground (..., 2) from the line; infinite beside its ends."""
+        other = places[..., 1 - self.axis]
+        beside = (other >= self.begin) & (other < self.end)
+        return np.where(beside, places[..., self.axis] - self.at, np.inf)
 
-    def block_of(self, places: Float64) -> NDArray[np.int64]:
-        """Index (n,) of the block in whose cell each point (n, 2) lies."""
-        found = np.full(len(places), -1)
-        for index, block in enumerate(self.plan.blocks):
-            found[((places >= block.cell.low) & (places < block.cell.high)).all(axis=1)] = index
-        return found
+
+def borders_of(plan: BlockPlan) -> list[Border]:
+    """Find the lines between the blocks of a plan."""
+    found = []
+    for block in plan.blocks:
+        for axis, other in ((0, 1), (1, 0)):
+            if np.isfinite(at := block.cell.high[axis]):
+                found.append(Border(axis, at, block.cell.low[other], block.cell.high[other]))
+    return found
 
 
 def unprojected(camera: Camera, depth: Float32) -> Float64:
@@ -78,62 +79,62 @@ def unprojected(camera: Camera, depth: Float32) -> Float64:
     return np.asarray(local @ camera.rotation)
 
 
-@dataclass
-class Ground:
-    """Places of the pixels of held-out views, by the depths that a model has.
-
-    distances: for each view, distances (H, W) from the nearest border; infinite where the model is transparent.
-    owners: for each view, the index of the block (H, W); -1 there.
-    """
-
-    distances: list[Float64]
-    owners: list[NDArray[np.int64]]
-
-
-def ground_of(renderer: Renderer, model: Gaussians, views: Sequence[View], border: Border) -> Ground:
-    """Measure where the pixels of views lie on the ground. The depth is the median of the model's along the ray."""
-    ground, axes = Ground([], []), np.array(border.plan.axes)
+def ground_of(renderer: Renderer, model: Gaussians, views: Sequence[View], plan: BlockPlan) -> list[Float64]:
+    """Return, for each view, where its pixels lie on the ground (H, W, 2), by the median depth of a model along the
+    rays; NaN where the model is transparent."""
+    places, axes = [], np.array(plan.axes)
     for view in views:
         result, channels = renderer.render_channels(model, view.camera)
         there = (result.alpha > 0.5) & np.isfinite(channels["median"])
-        places = unprojected(view.camera, np.where(there, channels["median"], 1.0)) @ axes.T
-        flat = places.reshape(-1, 2)
-        ground.distances.append(np.where(there, border.distances(flat).reshape(there.shape), np.inf))
-        ground.owners.append(np.where(there, border.block_of(flat).reshape(there.shape), -1))
-    return ground
+        found = unprojected(view.camera, np.where(there, channels["median"], 1.0)) @ axes.T
+        places.append(np.where(there[:, :, None], found, np.nan))
+    return places
 
 
-def psnrs(renders: Sequence[Float32], photographs: Sequence[Float32], ground: Ground, band: float) -> list[float]:
+def from_borders(places: Float64, borders: Sequence[Border]) -> Float64:
+    """Distance (H, W) of pixels at `places` (H, W, 2) from the nearest border; NaN where there is no place."""
+    nearest = np.min([np.abs(border.distances(places)) for border in borders], axis=0)
+    return np.where(np.isnan(places[..., 0]), np.nan, nearest)
+
+
+def psnrs(
+    renders: Sequence[Float32], photographs: Sequence[Float32], ground: Sequence[Float64], borders: Sequence[Border]
+) -> list[float]:
     """PSNR in dB of all pixels, of those in the band, and of those elsewhere: means over the views that have some."""
     found: list[list[float]] = [[], [], []]
-    for image, photograph, distance in zip(renders, photographs, ground.distances, strict=True):
+    for image, photograph, places in zip(renders, photographs, ground, strict=True):
         errors = np.square(np.clip(image, 0, 1).astype(np.float64) - photograph).mean(axis=2)
-        known = np.isfinite(distance)
-        for index, mask in enumerate((np.ones_like(known), known & (distance <= band), known & (distance > band))):
+        distance = from_borders(places, borders)
+        everywhere = np.ones(distance.shape, np.bool_)
+        for index, mask in enumerate((everywhere, distance <= BAND_METRES, distance > BAND_METRES)):
             if mask.sum() >= LEAST_PIXELS:
                 found[index].append(float(-10 * np.log10(errors[mask].mean())))
     return [float(np.mean(values)) for values in found]
 
 
 def colour_steps(
-    renders: Sequence[Float32], clean: Sequence[Float32], ground: Ground, band: float
-) -> tuple[float, float]:
-    """Mean and largest step of colour across the borders, in levels of 1/255.
+    renders: Sequence[Float32], clean: Sequence[Float32], ground: Sequence[Float64], borders: Sequence[Border]
+) -> list[float]:
+    """Steps of colour across borders, in levels of 1/255, as means over the channels.
 
-    clean: the photographs without changes of exposure. A gain for each channel, the same for all pixels, is taken out.
-    A step is the difference of the mean error between the band's pixels of two blocks, and the mean is over channels.
+    clean: the photographs without changes of exposure. In the band of a border, a gain for each channel is taken out,
+        and the step is the difference between the mean errors on the border's sides.
     """
-    pixels = [
-        (image[m], photo[m], owner[m])
-        for image, photo, distance, owner in zip(renders, clean, ground.distances, ground.owners, strict=True)
-        for m in [distance <= band]
-    ]
-    image, photo, owner = (np.concatenate(parts) for parts in zip(*pixels, strict=True))
-    gain = (image * photo).sum(axis=0) / np.square(image).sum(axis=0)
-    errors = image * gain - photo
-    means = {block: errors[owner == block].mean(axis=0) for block in np.unique(owner) if (owner == block).sum() > 100}
-    steps = [255 * np.abs(a - b).mean() for i, a in means.items() for j, b in means.items() if i < j]
-    return (float(np.mean(steps)), float(np.max(steps))) if steps else (0.0, 0.0)
+    steps = []
+    for border in borders:
+        sides: list[list[Float64]] = [[], []]
+        for image, photograph, places in zip(renders, clean, ground, strict=True):
+            distance = border.distances(places)
+            for side, mask in enumerate(
+                ((distance >= -BAND_METRES) & (distance < 0), (distance >= 0) & (distance < BAND_METRES))
+            ):
+                sides[side].append(np.stack([image[mask], photograph[mask]], axis=1).astype(np.float64))
+        low, high = (np.concatenate(parts) for parts in sides)
+        both = np.concatenate([low, high])
+        gain = (both[:, 0] * both[:, 1]).sum(axis=0) / np.square(both[:, 0]).sum(axis=0)
+        means = [(side[:, 0] * gain - side[:, 1]).mean(axis=0) for side in (low, high)]
+        steps.append(float(255 * np.abs(means[0] - means[1]).mean()))
+    return steps
 
 
 @contextmanager
@@ -213,7 +214,7 @@ def blocks(given: Namespace) -> Rows:
     growth = f"density.growth=budget,density.max-gaussians={given.gaussians}"
     city = city_of(given, town, "frozen", f"{settings},{growth}")
     plan = read_plan(city)
-    border, scene = Border(plan, BAND_METRES), load_scene(town, resolution=given.resolution)
+    borders, scene = borders_of(plan), load_scene(town, resolution=given.resolution)
     models = models_of(city)
     count = f"density.growth=budget,density.max-gaussians={len(models['finished'])}"
     done = trained(
@@ -223,7 +224,7 @@ def blocks(given: Namespace) -> Rows:
     yield f"photographs of all blocks / of the scene: {of_blocks / len(scene.train_views):.2f}"
     yield "model", "Gaussians", "PSNR, dB", "band", "elsewhere", "band less elsewhere"
     everything = {"whole": done.model, **models}
-    ground = ground_of(renderer, everything["whole"], scene.test_views, border)
+    ground = ground_of(renderer, done.model, scene.test_views, plan)
     with no_surroundings():
         alone = city_of(given, town, "alone", settings, planned=city)
     everything |= {f"{name}, without surroundings": model for name, model in models_of(alone).items()}
@@ -231,9 +232,10 @@ def blocks(given: Namespace) -> Rows:
     pictures: dict[str, list[Float32]] = {}
     for name, model in everything.items():
         pictures[name] = [renderer.render(model, view.camera).image for view in scene.test_views]
-        values = psnrs(pictures[name], photographs, ground, BAND_METRES)
+        values = psnrs(pictures[name], photographs, ground, borders)
         yield name, f"{len(model):,}", *(f"{value:.2f}" for value in values), f"{values[1] - values[2]:.2f}"
-    save_pictures(given.folder / "pictures", scene, ground, photographs, pictures)
+    shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
+    save_pictures(given.folder / "pictures", scene, shares, photographs, pictures)
     yield from floaters(given, renderer, scene, {"frozen": city, "without": alone}, done.model)
     if given.exposure:
         yield from exposures(given, renderer, scene, f"{settings},{growth}")
@@ -241,11 +243,13 @@ def blocks(given: Namespace) -> Rows:
 
 
 def save_pictures(
-    folder: Path, scene: Scene, ground: Ground, photographs: list[Float32], pictures: dict[str, list[Float32]]
+    folder: Path, scene: Scene, shares: list[float], photographs: list[Float32], pictures: dict[str, list[Float32]]
 ) -> None:
-    """Write strips of the held-out views with the most pixels in the band: photograph, then each model's render."""
+    """Write strips of the held-out views with the most pixels in the band: photograph, then each model's render.
+
+    shares: fraction of each view's pixels in the band.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    shares = [float((distance <= BAND_METRES).mean()) for distance in ground.distances]
     for place in np.argsort(shares)[::-1][:3]:
         rows = [photographs[place], *(images[place] for images in pictures.values())]
         name = scene.test_views[place].name.replace("/", "-").rpartition(".")[0]
@@ -295,32 +299,43 @@ def from_outside(scene: Scene, plan: BlockPlan) -> list[Camera]:
         right = np.cross(forward, up)
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
-        position = middle - forward * 1.1 * size
+        position = middle - forward * 1.3 * size
         cameras.append(Camera(320, 200, 260.0, 260.0, 160.0, 100.0, rotation, -rotation @ position))
     return cameras
 
 
 def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str) -> Rows:
-    """Steps of colour across the borders of a town whose exposure drifts, before and after the finish."""
+    """Steps of colour across the borders of a town whose exposure drifts, and across lines beside them."""
     town = town_of(given, given.exposure)
     settings = f"{settings},appearance=exposure"
     city = city_of(given, town, "exposure", settings)
     with own_appearance():
         other = city_of(given, town, "exposure own", settings, planned=city)
-    border = Border(read_plan(city), BAND_METRES)
+    plan = read_plan(city)
+    borders = borders_of(plan)
+    beside = [replace(border, at=border.at + BESIDE_METRES) for border in borders]
     clean = [view.load()[:, :, :3] for view in scene.views]
-    yield "appearance of blocks", "model", "mean step of colour, levels", "largest"
-    rows: list[tuple[str, Callable[[], dict[str, Gaussians]]]] = [
-        ("of the coarse model", partial(models_of, city)),
-        ("their own", partial(models_of, other)),
-    ]
-    ground = ground_of(renderer, models_of(city)["finished"], scene.views, border)
-    for kind, models in rows:
-        for name, model in models().items():
+    yield (
+        "appearance of blocks",
+        "model",
+        "mean step of colour, levels",
+        "largest",
+        "beside the borders: mean",
+        "largest",
+    )
+    ground = ground_of(renderer, models_of(city)["finished"], scene.views, plan)
+    kinds = {
+        "of the coarse model": city,
+        "their own": other,
+        "exposure without drift": given.folder / "cities" / "frozen",
+    }
+    for kind, folder in kinds.items():
+        for name, model in models_of(folder).items():
             images = [renderer.render(model, view.camera).image for view in scene.views]
-            mean, largest = colour_steps(images, clean, ground, BAND_METRES)
-            yield kind, name, f"{mean:.2f}", f"{largest:.2f}"
-            place = int(np.argmax([float((distance <= BAND_METRES).mean()) for distance in ground.distances]))
+            across, along = (colour_steps(images, clean, ground, lines) for lines in (borders, beside))
+            yield kind, name, *(f"{value:.2f}" for steps in (across, along) for value in (np.mean(steps), max(steps)))
+            shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
+            place = int(np.argmax(shares))
             file = f"{scene.views[place].name.replace('/', '-')}-{kind.replace(' ', '-')}-{name}.png"
             write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
     return 0

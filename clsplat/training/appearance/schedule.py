@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.config.colour_models import rise_in_short_training
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
@@ -19,9 +20,6 @@ from clsplat.device.context import Device
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
 """Number of steps in which the learning rate rises at first (at most a tenth of all steps), and the fraction of the
 full rate with which it begins."""
-FULL_LENGTH_STEPS = 10_000
-"""Number of steps below which a training counts as short. In a training of this length, at the learning rate of the
-settings, a gain can change by about 2 octaves."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
@@ -34,7 +32,7 @@ def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens:
     """
     rise: float = WARM_UP_START_FRACTION ** (1 - min(step / min(APPEARANCE_WARM_UP_STEPS, config.iterations / 10), 1.0))
     fall: float = ends ** (step / config.iterations)
-    short = max(FULL_LENGTH_STEPS / config.iterations, 1.0) if hastens else 1.0
+    short = rise_in_short_training(config.iterations) if hastens else 1.0
     return float(config.appearance_rate * short * views**0.5 * rise * fall)
 
 
