@@ -166,5 +166,8 @@ def scene_differences(
     now = scene_record.record_of(replace(scene, views=views), earlier["resolution"])
     # `origin` comes from all cameras, so it is not known from a part of the views
     earlier = {**earlier, "views": {name: view for name, view in earlier["views"].items() if name in names}}
-    # photographs colour points that have no colour, such as the sky's: the coarse model's are of another size
+    # The coarse model's photographs have another size. So have the sky's points another number, and points without
+    # colours other colours.
+    if settings.sky:
+        now["points"] = earlier["points"]
     return scene_record.differences(earlier, now, moved=True)

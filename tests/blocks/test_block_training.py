@@ -175,3 +175,18 @@ def test_a_folder_that_another_process_writes_is_refused(city: Path, default_dev
         said = refusal(lambda: train_block(city, "0,0", load(), trains_on(default_device)))
         other.stdin.close()
     assert "blocks/0_0: is being written by clsplat blocks (process" in said
+
+
+@pytest.mark.parametrize("sky", [0, 5])
+def test_only_the_skys_points_may_be_others(city: Path, default_device: Device, sky: int) -> None:
+    """How many points the sky gets depends on the size of the photographs, which the coarse model has another."""
+    plan = json.loads((city / "plan.json").read_text())
+    plan["train"]["sky"] = sky
+    (city / "plan.json").write_text(json.dumps(plan))
+    record = json.loads((city / "coarse" / "scene.json").read_text())
+    record["points"]["count"] += 1
+    (city / "coarse" / "scene.json").write_text(json.dumps(record))
+    if sky:
+        assert train_block(city, "0,0", load(), trains_on(default_device))
+    else:
+        assert "other points" in refusal(lambda: train_block(city, "0,0", load(), trains_on(default_device)))
