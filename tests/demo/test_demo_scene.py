@@ -5,6 +5,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from calls import refuses
+from demo_photographs import baked_still_life
 
 from clsplat.camera import Camera
 from clsplat.capture.folder import CaptureFolder
@@ -15,9 +16,7 @@ from clsplat.shots.viewpoints import look_at
 
 @pytest.fixture(scope="module")
 def surfaces():
-    objects = ray_caster.still_life()
-    ray_caster.bake(objects, seed=0)
-    return objects
+    return baked_still_life()
 
 
 @pytest.mark.parametrize("name", ["photos", "scene", "run", "turntable"])

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from demo_photographs import baked_still_life
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -50,8 +51,7 @@ class Walk:
 
 def walk(width: int, height: int, count: int, fps: int = 10, sub_frames: int = 3, seed: int = 0) -> Walk:
     """Render a walk of `count` frames. sub_frames: pictures that are averaged for a frame of a moving camera."""
-    surfaces = ray_caster.still_life()
-    ray_caster.bake(surfaces, seed)
+    surfaces = baked_still_life()
     rng = np.random.default_rng(seed)
     frames: list[NDArray[np.float32]] = []
     parts: list[Part] = []
