@@ -244,3 +244,18 @@ def test_chunks_are_caught_up_in_time(scene: Scene, default_device: Device, of_w
             patch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", measured)
             got, _, _ = trained(scene, CONFIG, [default_device])
         assert_same(got, of_whole(scene, "dense", default_device))
+
+
+def test_views_that_show_nothing(scene: Scene, default_device: Device) -> None:
+    """Also on a further device."""
+    model = wide_model()
+    model.means += 1e4
+    found = []
+    for most in (1 << 30, 2 * CHUNK_ROWS):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(visible_chunks, "ORDERED_ROWS", most)
+            trainer = Trainer(scene, CONFIG, default_device, model, further=[opened_again(default_device)])
+            run_steps(3, trainer)
+            found.append(state(trainer))
+            trainer.close()
+    assert_same(*found)
