@@ -119,7 +119,8 @@ def test_the_bytes_of_the_whole_model(
     assert trainer.parameters.count > 2 * CHUNK_ROWS
 
 
-@pytest.mark.parametrize("lanes", quick([1, 4], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 4])
 def test_other_kernel_shapes(scene: Scene, default_device: Device, lanes: int) -> None:
     """Against the same shape's steps over the whole model."""
     device = shaped(default_device, lanes, 64 if lanes == 1 else 1)
@@ -130,7 +131,7 @@ def test_other_kernel_shapes(scene: Scene, default_device: Device, lanes: int) -
 
 
 @pytest.mark.parametrize("optimiser", quick(["dense", "sparse"], "dense"))
-@pytest.mark.parametrize("name", quick(LIMITS, "device 5 MiB", "host 1 MiB"))
+@pytest.mark.parametrize("name", quick(LIMITS, "device 5 MiB"))
 @pytest.mark.parametrize("parts", quick([1, 2], 2))
 def test_a_streamed_model(
     scene: Scene, default_device: Device, tmp_path: Path, of_whole: Callable[..., State], optimiser: str, name: str,
