@@ -4,8 +4,8 @@
 // adam and adam_visible also set the gradients to zero for the next step, because project_grad writes only the rows of
 // visible Gaussians.
 //
-// With CHUNKS (shared/chunks.h) the gradients in adam, and the gradients and tile_counts in add_view, have the rows of the
-// launch, which are rows of listed chunks.
+// With CHUNKS (shared/chunks.h) the gradients in adam, and the gradients and tile_counts in add_view, have the rows of
+// the launch, which are rows of listed chunks.
 //
 // Owner: A work-item owns ABREAST (shared/adam.h) consecutive elements in adam, ABREAST rows in adam_visible, and one
 //   element in add_view.
@@ -21,8 +21,8 @@
 #include "shared/chunks.h"
 
 // Updates a parameter group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n);
-// with CHUNKS, gradients (n), and rows of WIDTH floats of the other arrays. With SPARSE (OptimiserConfig.sparse) elements
-// whose gradient is zero do not change.
+// with CHUNKS, gradients (n), and rows of WIDTH floats of the other arrays. With SPARSE (OptimiserConfig.sparse)
+// elements whose gradient is zero do not change.
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second CHUNK_PARAMETERS) {

@@ -119,7 +119,8 @@ def test_the_bytes_of_the_whole_model(
     assert trainer.parameters.count > 2 * CHUNK_ROWS
 
 
-@pytest.mark.parametrize("lanes", quick([1, 4], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 4])
 def test_other_kernel_shapes(scene: Scene, default_device: Device, lanes: int) -> None:
     """Against the same shape's steps over the whole model."""
     device = shaped(default_device, lanes, 64 if lanes == 1 else 1)
@@ -130,7 +131,7 @@ def test_other_kernel_shapes(scene: Scene, default_device: Device, lanes: int) -
 
 
 @pytest.mark.parametrize("optimiser", quick(["dense", "sparse"], "dense"))
-@pytest.mark.parametrize("name", quick(LIMITS, "device 5 MiB", "host 1 MiB"))
+@pytest.mark.parametrize("name", quick(LIMITS, "device 5 MiB"))
 @pytest.mark.parametrize("parts", quick([1, 2], 2))
 def test_a_streamed_model(
     scene: Scene, default_device: Device, tmp_path: Path, of_whole: Callable[..., State], optimiser: str, name: str,
@@ -244,3 +245,18 @@ def test_chunks_are_caught_up_in_time(scene: Scene, default_device: Device, of_w
             patch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", measured)
             got, _, _ = trained(scene, CONFIG, [default_device])
         assert_same(got, of_whole(scene, "dense", default_device))
+
+
+def test_views_that_show_nothing(scene: Scene, default_device: Device) -> None:
+    """Also on a further device."""
+    model = wide_model()
+    model.means += 1e4
+    found = []
+    for most in (1 << 30, 2 * CHUNK_ROWS):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(visible_chunks, "ORDERED_ROWS", most)
+            trainer = Trainer(scene, CONFIG, default_device, model, further=[opened_again(default_device)])
+            run_steps(3, trainer)
+            found.append(state(trainer))
+            trainer.close()
+    assert_same(*found)

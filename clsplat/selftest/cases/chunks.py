@@ -222,8 +222,7 @@ def _launch_batch(
     step: AdamStep,
 ) -> Read:
     """Take the step with kernels of a step of several views: gradients of the listed chunks, their sums, then Adam."""
-    model = (upload_gaussians(device, given.gaussians), *uploaded_groups(device, given.moments))
-    parameters, *moments = model
+    parameters, (first, second) = upload_gaussians(device, given.gaussians), uploaded_groups(device, given.moments)
     gradients, sums = (allocate_gaussians(device, chunks.rows, parameters.coefficients, zero=True) for _ in range(2))
     camera_array, projected, slots, screen = view
     project_grad(device, parameters, camera_array, projected, slots, gradients, screen)
@@ -231,7 +230,8 @@ def _launch_batch(
     in_sums = ChunkList(upload(device, places[::-1].copy()), sums.count)  # another order than that of the view
     add_view(device, projected.tile_counts, gradients, sums, places=in_sums)
     listed = ChunkList(upload(device, chunks.numbers.get()[::-1].copy()), chunks.model_rows)
-    adam(device, step, parameters, sums, *moments, chunks=listed)
+    adam(device, step, parameters, sums, first, second, chunks=listed)
+    model = (parameters, first, second)
     return lambda: {f"batch {name}": _flat(each) for name, each in zip(STATE, model, strict=True)}
 
 
@@ -285,10 +285,11 @@ def _twin_of_adam(given: Inputs, got: Arrays, listed: NDArray[np.bool_]) -> dict
     rows = "sparse" if given.sparse else "late"
     step = Inputs(arrays=arrays, rows=rows, step=STEP, visible=listed, rates=ADAM_RATES)
     got["gradients"] = np.zeros(0)  # project_step keeps no gradients in memory
-    of_batch = {name: got[f"batch {name}"] for name in STATE} | {"gradients": np.zeros(0)}
+    of_batch: dict[str, Array] = {name: got[f"batch {name}"] for name in STATE}
+    of_batch["gradients"] = np.zeros(0)
     wanted = {f"batch {name}": each for name, each in ADAM_CASE.twin(step, of_batch).items()}
-    got |= {f"batch {name}": each for name, each in of_batch.items()}
-    return wanted | ADAM_CASE.twin(step, got)
+    got.update({f"batch {name}": each for name, each in of_batch.items()})
+    return {**wanted, **ADAM_CASE.twin(step, got)}
 
 
 CHUNKS_CASE = Case(

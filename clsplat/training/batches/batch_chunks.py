@@ -101,7 +101,7 @@ class BatchChunks:
         return CHUNK_ROWS * min(listed_chunks(len(_in_view(inputs))), most)
 
     def places(self, inputs: ViewInputs, start: int, stop: int) -> ChunkList:
-        """List for the rows [start, stop) of a view the place of each chunk among the chunks of the sums."""
+        """Return, for the rows [start, stop) of a view, the list of each chunk's place among the chunks of the sums."""
         chunks = slice(start // CHUNK_ROWS, chunks_of(stop))
         numbers = np.full(chunks.stop - chunks.start, NO_CHUNK, np.uint32)
         found = np.searchsorted(self.numbers, _in_view(inputs)[chunks])
@@ -135,7 +135,10 @@ class BatchChunks:
             yield models, DeviceGaussians(stop - start, self.sums.coefficients, arrays), slots
 
     def parameters(self, inputs: ViewInputs, room: HostRoom) -> dict[str, Float32]:
-        """Copy the parameters of a view's chunks to the host, by group. Padding rows at the end are left out."""
+        """Return a copy on the host of the parameters of a view's chunks, by group, without rows past the model's end.
+
+        room: memory for the copy.
+        """
         numbers, model = _in_view(inputs), self.model[0]
         whole, rest = numbers, 0
         if self.pool is None and len(numbers) and numbers[-1] == model.count // CHUNK_ROWS:

@@ -229,7 +229,8 @@ class VisibleChunks(Component):
         by_view = []
         for each in inputs:
             found = self._ahead.get((each.camera, step, self._found))
-            by_view.append(self._shown(each.camera, step, hidden, most_hidden) if found is None else found)
+            found = self._shown(each.camera, step, hidden, most_hidden) if found is None else found
+            by_view.append(found if len(found) else np.zeros(1, np.uint32))  # a further device needs some rows
         numbers = by_view[0] if len(by_view) == 1 else np.unique(np.concatenate(by_view))
         if self._before_view is not None:
             self._before_view(max(map(len, by_view)), len(numbers))
