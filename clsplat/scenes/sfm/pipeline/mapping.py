@@ -33,6 +33,19 @@ def incremental_models(
     relaxed: accept smaller triangulation angles and fewer matches than by default.
     placed: function that is called after each photograph that is added to the first two.
     """
+    output.mkdir()
+    models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+        database_path=database,
+        image_path=photos,
+        output_path=output,
+        options=_incremental_options(threads, seed, relaxed=relaxed),
+        next_image_callback=placed,
+    )
+    return {output / str(index): model for index, model in models.items()}
+
+
+def _incremental_options(threads: int, seed: int, *, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
+    """Return options for pycolmap's incremental mapper. relaxed: as in `incremental_models`."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = threads
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -48,15 +61,29 @@ def incremental_models(
         options.mapper.abs_pose_min_num_inliers = 15
         options.mapper.filter_min_tri_angle = 0.8
         options.triangulation.min_angle = 1.0
-    output.mkdir()
-    models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+    return options
+
+
+def add_two_view_points(
+    database: Path, photos: Path, folder: Path, *, threads: int, seed: int, relaxed: bool
+) -> pycolmap.Reconstruction:
+    """Add the points that only two photographs show to the model in a folder. Returns and writes the model.
+
+    The mappers leave out these points, as points with more observations give better poses. But a training starts from
+    the points, and at the edge of a capture many are seen by two photographs only. Poses and lenses stay as they are.
+
+    relaxed: True if the model comes from `incremental_models` with `relaxed`.
+    """
+    options = _incremental_options(threads, seed, relaxed=relaxed)
+    options.triangulation.ignore_two_view_tracks = False
+    return pycolmap.triangulate_points(
+        reconstruction=pycolmap.Reconstruction(folder),
         database_path=database,
         image_path=photos,
-        output_path=output,
+        output_path=folder,
+        clear_points=False,
         options=options,
-        next_image_callback=placed,
     )
-    return {output / str(index): model for index, model in models.items()}
 
 
 def global_models(database: Path, photos: Path, output: Path, *, threads: int, seed: int) -> Models:
