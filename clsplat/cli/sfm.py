@@ -32,7 +32,8 @@ class SfmVerb(Verb):
     """Number of frames to take from each video: the sharpest of as many stretches of equal motion. If not given: frames
     that were taken before are used, of any number; otherwise length and motion decide, at most 300."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
-    """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed."""
+    """Place one camera after another, or all at once. auto: one after another, and all at once if few are placed. auto
+    begins with all at once if there are many cameras, with fewer than 5 photos each in the mean."""
     features: Literal["sift", "aliked"] = "sift"
     """Features to match. aliked: features of a neural network, which needs the extra `learned`."""
     weights: Annotated[str | None, arg(metavar="PATH")] = None
@@ -40,7 +41,8 @@ class SfmVerb(Verb):
     aliked-n16rot. If it cannot be fetched within 30 seconds, SIFT features are used."""
     matching: Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"] = "auto"
     """Pairs of photos to match: all, neighbours in name order or in a video, the nearest by GPS, or the most similar.
-    auto: all up to 40 photos, neighbours and similar frames of videos, near photos with GPS, else similar photos."""
+    auto: all up to 40 photos, neighbours and similar frames of videos, near photos with GPS, else similar photos. After
+    near or similar photos, pairs that show the same by the first matches are matched too."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
     """Lens model to fit, by COLMAP's name. The scene's images are undistorted with it. auto: OPENCV for a camera with
     20 photos or more, else SIMPLE_RADIAL."""

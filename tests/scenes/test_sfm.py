@@ -6,6 +6,7 @@ import json
 import shutil
 import sqlite3
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -112,10 +113,11 @@ def test_every_pose_is_recovered(scene, pictures):
     assert record["mean_reprojection_error"] < 0.5
     stages = list(dict.fromkeys(text for text, _ in heard))
     matched = ["choosing pairs", "matching photos"]
-    assert stages == ["reading photos", "finding features", *matched, "placing cameras", "undistorting photos"]
+    placing = ["placing cameras", "adding points", "undistorting photos"]
+    assert stages == ["reading photos", "finding features", *matched, *placing]
     assert (record["matching"], record["pairs"]) == ("exhaustive", COUNT * (COUNT - 1) // 2)
     assert (record["mapper"], record["features"], record["fragments"]) == ("incremental", "sift", [])
-    assert {"features", "pairs", "matches", "cameras", "undistorting"} == set(record["seconds"])
+    assert {"features", "pairs", "matches", "cameras", "points", "undistorting"} == set(record["seconds"])
     placed = [fraction.text for text, fraction in heard if text == "placing cameras"]
     assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras placed", f"{COUNT} of {COUNT} cameras placed")
     assert len(placed) > 3  # they are counted as they come
@@ -216,7 +218,10 @@ def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threa
     """With several threads the bytes differ in one of 70 runs on a busy machine, so that two equal runs show little."""
     names, given = [f"{index}.jpg" for index in range(count)], []
     monkeypatch.setattr(worker.matching, "matched_pairs", lambda *_: ("retrieval", [(1, 2)]))
-    for name in ("match_image_pairs", "incremental_mapping", "calibrate_view_graph", "global_mapping"):
+    monkeypatch.setattr(worker.matching, "overlapping_pairs", lambda *_: [(1, 3)])
+    monkeypatch.setattr(worker.pycolmap, "Reconstruction", lambda _: None)
+    mappers = ("incremental_mapping", "calibrate_view_graph", "global_mapping", "triangulate_points")
+    for name in ("match_image_pairs", *mappers):
         told = "matching_options" if name.startswith("match") else "options"
         monkeypatch.setattr(worker.pycolmap, name, lambda told=told, **all_: given.append(all_[told]) or {})
     monkeypatch.setattr(worker.matching.sfm_database, "image_names", lambda _: {})
@@ -224,11 +229,39 @@ def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threa
     settings = sfm.SfmSettings(mapper=mapper)
     photos = [sfm_photos.Photo(name, name, 40, 30, ()) for name in names]
     work = worker.Worker(sfm.sfm_task(settings, photos, [], [], tmp_path, 3), io.StringIO())
-    work.match()
+    assert work.match() == ("retrieval", 2)
     work.map()
+    work.add_points(tmp_path)
     assert {options.num_threads for options in given if hasattr(options, "num_threads")} == {threads}
     if mapper == "global":
-        assert given[-1].mapper.num_threads == threads
+        assert given[-2].mapper.num_threads == threads
+
+
+@pytest.mark.parametrize(
+    ("cameras", "at_once", "tried"),
+    [
+        (1, 50, ["one by one"]),
+        (10, 50, ["one by one", "at once"]),  # 5 photographs of a camera
+        (11, 50, ["at once"]),
+        (11, 15, ["at once"]),  # 30 %
+        (11, 14, ["at once", "one by one", "relaxed"]),
+    ],
+)
+def test_photographs_of_many_cameras_are_placed_at_once_first(cameras, at_once, tried, tmp_path, monkeypatch):
+    names, done = [f"{index}.jpg" for index in range(50)], []
+    placed = {"at once": at_once, "one by one": 50 if cameras == 1 else 29, "relaxed": 0}
+
+    def models(way):
+        done.append(way)
+        return {tmp_path / way: SimpleNamespace(num_reg_images=lambda: placed[way])}
+
+    groups = [names[start::cameras] for start in range(cameras)]
+    task = {"photos": tmp_path, "work": tmp_path, "groups": groups, "mapper": "auto"}
+    work = worker.Worker(task, io.StringIO())
+    monkeypatch.setattr(work, "solve_at_once", lambda: models("at once"))
+    monkeypatch.setattr(work, "add_one_by_one", lambda *, relaxed: models("relaxed" if relaxed else "one by one"))
+    work.map()
+    assert done == tried
 
 
 @pytest.mark.slow

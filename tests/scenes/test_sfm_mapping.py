@@ -108,3 +108,28 @@ def test_gps_holds_the_cameras_in_metres(
     ]
     # The robust loss still lets the two positions pull the cameras, which are only 10 m apart: 2 % were seen.
     assert (abs(sizes[0] / sizes[1] - 1) < 0.05) == by_gps
+
+
+@pytest.mark.parametrize("relaxed", [False, True])
+def test_points_of_two_photographs_are_added(tmp_path: Path, *, relaxed: bool) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 1, 1
+    options.num_points3D, options.num_points2D_without_point3D = 60, 0
+    pycolmap.set_random_seed(0)
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        model = pycolmap.synthesize_dataset(options, opened)
+    poses = {image: model.images[image].cam_from_world().matrix() for image in model.reg_image_ids()}
+    lenses = {camera: model.cameras[camera].params.tolist() for camera in model.cameras}
+    kept = sorted(model.point3D_ids())[:20]
+    for point in set(model.point3D_ids()) - set(kept):
+        model.delete_point3D(point)
+    model.write(tmp_path)
+    found = mapping.add_two_view_points(
+        tmp_path / "database.db", tmp_path, tmp_path, threads=1, seed=0, relaxed=relaxed
+    )
+    assert found.num_points3D() == pycolmap.Reconstruction(tmp_path).num_points3D() > 50  # some have too small an angle
+    assert {image: found.images[image].cam_from_world().matrix().tolist() for image in poses} == {
+        image: pose.tolist() for image, pose in poses.items()
+    }
+    assert {camera: found.cameras[camera].params.tolist() for camera in lenses} == lenses
+    assert found.compute_mean_reprojection_error() < 1e-3  # the synthetic features have no noise

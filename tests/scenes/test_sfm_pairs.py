@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 import pytest
 
+from clsplat.scenes.sfm.pipeline import database as sfm_database
 from clsplat.scenes.sfm.pipeline import matching
 from clsplat.scenes.sfm.pipeline import photo_pairs as pairs
 
@@ -157,3 +159,62 @@ def test_similar_photographs_are_paired(database, tmp_path):
     chosen, found = matching.matched_pairs(tmp_path, "auto", [], 0)
     assert chosen == "retrieval"
     assert {(at + 1, at + 21) for at in range(40)} <= set(found)
+
+
+def rows_of(*matches):
+    return np.array(matches, np.uint32).reshape(-1, 2)
+
+
+def test_tracks_reach_photographs_by_way_of_others():
+    matches = {(0, 1): rows_of((0, 1), (1, 2), (2, 0)), (1, 2): rows_of((1, 3), (0, 1)), (2, 3): rows_of()}
+    shared = pairs.shared_tracks([3, 3, 4, 5], matches)
+    assert shared.tolist() == [[0, 3, 2, 0], [3, 0, 2, 0], [2, 2, 0, 0], [0, 0, 0, 0]]
+
+
+def test_a_track_that_a_photograph_shows_twice_counts_once():
+    matches = {(0, 1): rows_of((0, 0)), (1, 2): rows_of((0, 0)), (0, 2): rows_of((1, 0))}
+    assert pairs.shared_tracks([2, 1, 1], matches).tolist() == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
+
+
+@pytest.mark.parametrize("counts", [[], [0], [0, 3]])
+def test_no_matches_are_no_tracks(counts):
+    shared = pairs.shared_tracks(counts, {})
+    assert shared.shape == (len(counts), len(counts))
+    assert not shared.any()
+
+
+def test_pairs_of_the_second_round_share_enough_tracks():
+    least = pairs.MIN_SHARED_TRACKS
+    shared = np.array([[0, 99, least, least - 1], [99, 0, 0, 0], [least, 0, 0, 0], [least - 1, 0, 0, 0]])
+    assert pairs.track_pairs(shared, [(0, 1)]) == [(0, 2)]
+    assert pairs.track_pairs(shared, []) == [(0, 1), (0, 2)]
+    assert pairs.track_pairs(shared, [(0, 1), (0, 2)]) == []
+
+
+def test_the_second_round_takes_the_photographs_that_share_most():
+    count = pairs.TRACK_NEIGHBOURS + 2
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    found = pairs.track_pairs(1000 - apart, [])
+    assert (0, count - 1) not in found
+    assert set(pairs.all_pairs(count)) - set(found) == {(0, count - 1)}
+
+
+def test_pairs_of_the_second_round_are_read_from_the_database(tmp_path):
+    """Three photographs in a row, of which the first and the last share tracks by way of the one between."""
+    path, count = tmp_path / "database.db", pairs.MIN_SHARED_TRACKS
+    rows = np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)
+    with pycolmap.Database.open(path) as opened:
+        camera = opened.write_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 640, 480))
+        one, two, three, four = (
+            opened.write_image(pycolmap.Image(name=f"{name}.jpg", camera_id=camera)) for name in "abcd"
+        )
+        for image in (one, two, three):  # the last photograph has no features
+            opened.write_keypoints(image, np.zeros((count, 2), np.float32))
+        for pair in ((one, two), (two, three)):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = rows
+            opened.write_two_view_geometry(*pair, geometry)
+        opened.write_two_view_geometry(three, four, pycolmap.TwoViewGeometry())
+    assert sfm_database.feature_counts(path) == {one: count, two: count, three: count, four: 0}
+    assert sfm_database.verified_matches(path).keys() == {(one, two), (two, three)}
+    assert matching.overlapping_pairs(path, [(one, two), (two, three), (three, four)]) == [(one, three)]

@@ -16,8 +16,8 @@ from clsplat.scenes.sfm.reconstruct import SfmSettings, reconstruct
 
 COLUMNS = {
     "features": ("features", "learned features"),
-    "matching": ("pairs", "matches", "learned matches"),
-    "mapping": ("cameras", "cameras again", "cameras at once"),
+    "matching": ("pairs", "matches", "learned matches", "more pairs", "more matches", "more learned matches"),
+    "mapping": ("cameras", "cameras again", "cameras at once", "points"),
     "undistorting": ("undistorting",),
 }
 """Stages of `worker.Worker.seconds` that a column of the table adds up."""

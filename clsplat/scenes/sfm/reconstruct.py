@@ -58,13 +58,15 @@ class SfmSettings:
         outside videos in the order of names. "spatial": the nearest by EXIF's GPS. "retrieval": the most similar by
         their features. "auto": all pairs of up to 40 photographs. Of more: neighbours and the most similar if there
         are videos, the nearest if most have GPS positions and these differ enough, otherwise the most similar.
+        After "spatial" and "retrieval" more pairs follow, which show the same by the matches of the first.
     camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph, of which the largest are kept.
     mapper: "incremental" adds one photograph after another. "global" solves for all cameras at once. "auto" is
-        "incremental", and also "global" if "incremental" places less than 60 % of the photographs.
+        "incremental", and also "global" if "incremental" places less than 60 % of the photographs. Of more than 40
+        photographs with fewer than 5 for each camera, "global" is first.
     features: "sift", or "aliked", learned features.
     weights: for "aliked" the file of the network, or a name in `weights.WEIGHTS_BY_NAME`; None for the default name.
     seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.

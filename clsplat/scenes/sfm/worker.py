@@ -17,6 +17,7 @@ import shutil
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -26,6 +27,7 @@ from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm.pipeline import aliked, mapping, matching
 from clsplat.scenes.sfm.pipeline.database import feature_evidence, keep_largest, renumber_by_name
 from clsplat.scenes.sfm.pipeline.features import extract_sift
+from clsplat.scenes.sfm.pipeline.photo_pairs import MAX_EXHAUSTIVE_PHOTOS, Pair
 from clsplat.scenes.sfm.worker_progress import UNDISTORTED_IMAGES
 
 MAX_SINGLE_THREAD_PHOTOS = 80
@@ -43,8 +45,18 @@ MIN_GPS_PRIOR_PHOTOS = 200
 
 Long strips of photographs drift without them. The cameras of fewer photographs hardly change, but take twice the time.
 """
+RELAXED_FOLDER = "sparse-relaxed"
+"""Folder in the worker's folder for the models of the incremental mapper with lower thresholds."""
+TWO_ROUND_MATCHINGS = ("retrieval", "spatial")
+"""Choices of pairs after which a second round of matching follows (`matching.overlapping_pairs`)."""
 MIN_PLACED_FRACTION = 0.6
 """Fraction of the photographs below which mapping is repeated in another way."""
+MIN_PHOTOS_PER_CAMERA = 5
+"""Mean number of photographs of a camera below which "auto" uses the global mapper first. It never does so for
+MAX_EXHAUSTIVE_PHOTOS or fewer photographs."""
+MIN_PLACED_AT_ONCE_FRACTION = 0.3
+"""Fraction of the photographs below which the incremental mapper follows where the global mapper was first. Many
+photographs from the web show something else, and the incremental mapper places no more of them."""
 
 
 class Worker:
@@ -108,7 +120,7 @@ class Worker:
             self.say(failure=feature_evidence(self.database))
             return
         best, others = mapping.fragments(models)
-        model = models[best]
+        model = self.add_points(best)
         self.begin("undistorting", model.num_reg_images())
         self.undistort(best)
         self.end()
@@ -141,17 +153,37 @@ class Worker:
         renumber_by_name(self.database)
 
     def match(self) -> tuple[str, int]:
-        """Match and verify the features of the chosen pairs. Returns the matching and its number of pairs."""
-        seed, threads = self.task["seed"], self.reproducible_threads
+        """Match and verify the features of the chosen pairs. Returns the matching and its number of pairs.
+
+        Spatial matching and retrieval have a second round, with pairs that show the same by the matches of the first.
+        """
+        seed = self.task["seed"]
         self.begin("pairs", None)
         chosen, pairs = matching.matched_pairs(self.database, self.task["matching"], self.task["sequences"], seed)
-        if self.task["features"] == "aliked":
-            self.begin("learned matches", len(pairs))
-            aliked.match_aliked(self.database, pairs, threads=threads, seed=seed, done=lambda done: self.say(done=done))
-        else:
-            self.begin("matches", len(pairs))
-            matching.match_features(self.database, pairs, threads=threads, seed=seed)
+        self.match_pairs(pairs)
+        if chosen in TWO_ROUND_MATCHINGS:
+            self.begin("more pairs", None)
+            more = matching.overlapping_pairs(self.database, pairs)
+            if more:
+                self.match_pairs(more, before=len(pairs))
+            pairs += more
         return chosen, len(pairs)
+
+    def match_pairs(self, pairs: Sequence[Pair], *, before: int = 0) -> None:
+        """Match and verify the features of pairs of photographs.
+
+        before: number of pairs of the first round, in the second round of matching.
+        """
+        seed, threads = self.task["seed"], self.reproducible_threads
+        which, total = "more " if before else "", before + len(pairs)
+        if self.task["features"] == "aliked":
+            self.begin(f"{which}learned matches", total)
+            aliked.match_aliked(
+                self.database, pairs, threads=threads, seed=seed, done=lambda done: self.say(done=before + done)
+            )
+        else:
+            self.begin(f"{which}matches", total)  # the parent counts the pairs in the database
+            matching.match_features(self.database, pairs, threads=threads, seed=seed)
 
     def map(self) -> mapping.Models:
         """Recover camera poses and points. Returns all models.
@@ -159,19 +191,32 @@ class Worker:
         "auto" adds one photograph after another. If few are placed, as after a bad first pair, it solves for all at
         once. If few are placed again, the cameras may be close together, or there may be few features. Then
         photographs are added with lower thresholds. "incremental" does the same without solving for all at once.
+
+        Photographs of many cameras, as from the web, have many bad first pairs. There "auto" solves for all at once
+        first, and adds one photograph after another only if that places very few.
         """
         choice = self.task["mapper"]
-        models = {} if choice == "global" else self.add_one_by_one(relaxed=False)
-        if choice == "global" or (choice == "auto" and self.places_few(models)):
+        if choice == "global":
+            return self.solve_at_once()
+        at_once_first = choice == "auto" and self.has_many_cameras()
+        models = self.solve_at_once() if at_once_first else {}
+        if at_once_first and not self.places_few(models, MIN_PLACED_AT_ONCE_FRACTION):
+            return models
+        models |= self.add_one_by_one(relaxed=False)
+        if choice == "auto" and not at_once_first and self.places_few(models):
             models |= self.solve_at_once()
-        if choice != "global" and self.places_few(models):
+        if self.places_few(models):
             models |= self.add_one_by_one(relaxed=True)
         return models
 
-    def places_few(self, models: mapping.Models) -> bool:
-        """Return True if the largest model has less than MIN_PLACED_FRACTION of the photographs."""
+    def has_many_cameras(self) -> bool:
+        """Return True if there are fewer than MIN_PHOTOS_PER_CAMERA photographs for each camera in the mean."""
+        return self.count > MAX_EXHAUSTIVE_PHOTOS and self.count < MIN_PHOTOS_PER_CAMERA * len(self.task["groups"])
+
+    def places_few(self, models: mapping.Models, fraction: float = MIN_PLACED_FRACTION) -> bool:
+        """Return True if the largest model has less than this fraction of the photographs."""
         most = max((model.num_reg_images() for model in models.values()), default=0)
-        return most < MIN_PLACED_FRACTION * self.count
+        return most < fraction * self.count
 
     def solve_at_once(self) -> mapping.Models:
         """Recover models by global mapping."""
@@ -184,6 +229,18 @@ class Worker:
             seed=self.task["seed"],
         )
 
+    def add_points(self, best: Path) -> pycolmap.Reconstruction:
+        """Add points that only two photographs show to the model in the folder `best`. Returns the model."""
+        self.begin("points", None)
+        return mapping.add_two_view_points(
+            self.database,
+            self.photos,
+            best,
+            threads=self.reproducible_threads,
+            seed=self.task["seed"],
+            relaxed=best.parent.name == RELAXED_FOLDER,
+        )
+
     def add_one_by_one(self, *, relaxed: bool) -> mapping.Models:
         """Recover models by incremental mapping. relaxed: as in `mapping.incremental_models`."""
         self.begin("cameras again" if relaxed else "cameras", self.count)
@@ -191,7 +248,7 @@ class Worker:
         return mapping.incremental_models(
             self.database,
             self.photos,
-            self.work / ("sparse-relaxed" if relaxed else "sparse"),
+            self.work / (RELAXED_FOLDER if relaxed else "sparse"),
             threads=self.reproducible_threads,
             seed=self.task["seed"],
             relaxed=relaxed,

@@ -32,9 +32,13 @@ _PROGRESS_BY_STAGE = {
     "pairs": ("choosing pairs", None),
     "matches": ("matching photos", "two_view_geometries"),
     "learned matches": ("matching photos", None),
+    "more pairs": ("choosing more pairs", None),
+    "more matches": ("matching more photos", "two_view_geometries"),
+    "more learned matches": ("matching more photos", None),
     "cameras": ("placing cameras", None),
     "cameras again": ("placing cameras, second try", None),
     "cameras at once": ("placing all cameras at once", None),
+    "points": ("adding points", None),
     "undistorting": ("undistorting photos", UNDISTORTED_IMAGES),
 }
 

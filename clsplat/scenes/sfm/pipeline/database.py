@@ -110,6 +110,25 @@ def keep_largest(database: Path, most: int) -> None:
                 )
 
 
+def feature_counts(database: Path) -> dict[int, int]:
+    """Return the number of features of each photograph, keyed and ordered by the photographs' numbers."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        query = "SELECT i.image_id, COALESCE(k.rows, 0) FROM images i LEFT JOIN keypoints k USING (image_id) ORDER BY 1"
+        return dict(connection.execute(query).fetchall())
+
+
+def verified_matches(database: Path) -> dict[tuple[int, int], NDArray[np.uint32]]:
+    """Return the verified matches (M, 2) of each pair that has some: indices of features in the first and the second.
+
+    The key of a pair is the two photographs' numbers.
+    """
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        rows = connection.execute("SELECT pair_id, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id")
+        return {
+            pycolmap.pair_id_to_image_pair(pair): np.frombuffer(data, np.uint32).reshape(-1, 2) for pair, data in rows
+        }
+
+
 def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
     """Return the photographs' GPS positions (N, 2) in metres to the east and north of the first that is known.
 

@@ -44,24 +44,10 @@ def incremental_models(
     by_gps: hold the cameras near their GPS positions, except for those that are far off. The model is in metres then.
     placed: function that is called after each photograph that is added to the first two.
     """
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.min_model_size = MIN_MODEL_PHOTOS
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_GROWTH
-    options.ba_global_max_refinements, options.ba_local_max_refinements = GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS
-    # Poses are adjusted with enough points to cover every photograph, then the other points with these poses.
-    options.mapper.ba_global_ignore_redundant_points3D = True
+    options = _incremental_options(threads, seed, relaxed=relaxed)
     if by_gps:
         weight_gps(database)
         options.use_prior_position = options.use_robust_loss_on_prior_position = True
-    if relaxed:
-        options.mapper.init_min_tri_angle = 4.0
-        options.mapper.init_max_forward_motion = 1.0
-        options.mapper.init_min_num_inliers = 50
-        options.mapper.abs_pose_min_num_inliers = 15
-        options.mapper.filter_min_tri_angle = 0.8
-        options.triangulation.min_angle = 1.0
     output.mkdir()
     models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
         database_path=database,
@@ -71,6 +57,48 @@ def incremental_models(
         next_image_callback=placed,
     )
     return {output / str(index): model for index, model in models.items()}
+
+
+def _incremental_options(threads: int, seed: int, *, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
+    """Return options for pycolmap's incremental mapper. relaxed: as in `incremental_models`."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_model_size = MIN_MODEL_PHOTOS
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_GROWTH
+    options.ba_global_max_refinements, options.ba_local_max_refinements = GLOBAL_REFINEMENTS, LOCAL_REFINEMENTS
+    # Poses are adjusted with enough points to cover every photograph, then the other points with these poses.
+    options.mapper.ba_global_ignore_redundant_points3D = True
+    if relaxed:
+        options.mapper.init_min_tri_angle = 4.0
+        options.mapper.init_max_forward_motion = 1.0
+        options.mapper.init_min_num_inliers = 50
+        options.mapper.abs_pose_min_num_inliers = 15
+        options.mapper.filter_min_tri_angle = 0.8
+        options.triangulation.min_angle = 1.0
+    return options
+
+
+def add_two_view_points(
+    database: Path, photos: Path, folder: Path, *, threads: int, seed: int, relaxed: bool
+) -> pycolmap.Reconstruction:
+    """Add the points that only two photographs show to the model in a folder. Returns and writes the model.
+
+    The mappers leave out these points, as points with more observations give better poses. But a training starts from
+    the points, and at the edge of a capture many are seen by two photographs only. Poses and lenses stay as they are.
+
+    relaxed: True if the model comes from `incremental_models` with `relaxed`.
+    """
+    options = _incremental_options(threads, seed, relaxed=relaxed)
+    options.triangulation.ignore_two_view_tracks = False
+    return pycolmap.triangulate_points(
+        reconstruction=pycolmap.Reconstruction(folder),
+        database_path=database,
+        image_path=photos,
+        output_path=folder,
+        clear_points=False,
+        options=options,
+    )
 
 
 def global_models(database: Path, photos: Path, output: Path, *, threads: int, seed: int) -> Models:

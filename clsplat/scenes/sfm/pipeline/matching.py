@@ -67,6 +67,19 @@ def matched_pairs(
     return chosen, [(ids[one], ids[two]) for one, two in pairs]
 
 
+def overlapping_pairs(database: Path, pairs: Sequence[Pair]) -> list[Pair]:
+    """Return more pairs of photographs, which show the same by the matches of the pairs that are matched already.
+
+    pairs: numbers of the photographs that are matched already. The result has such numbers too.
+    """
+    counts = sfm_database.feature_counts(database)
+    ids, place = list(counts), {image: at for at, image in enumerate(counts)}
+    matches = {(place[one], place[two]): rows for (one, two), rows in sfm_database.verified_matches(database).items()}
+    shared = sfm_pairs.shared_tracks(list(counts.values()), matches)
+    more = sfm_pairs.track_pairs(shared, [(place[one], place[two]) for one, two in pairs])
+    return [(ids[one], ids[two]) for one, two in more]
+
+
 def verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
     """Return options with which verifying a pair's matches takes half as long as with pycolmap's defaults.
 

@@ -6,12 +6,14 @@ A pair has two indices of photographs, the smaller first. Lists of pairs are sor
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
 
 Pair = tuple[int, int]
 
@@ -27,13 +29,14 @@ LOOP_NEIGHBOURS = 10
 
 They close the loops of a video's camera path, and join photographs without a GPS position to the others.
 """
-ALIKE_NEIGHBOURS = 15
-"""Number of the most similar photographs that retrieval matches with each photograph.
-
-In rgbd_7scenes, whose 4,950 pairs were all matched, the 859 pairs of 15 neighbours have 60 % of all verified matches.
-"""
-NEAR_NEIGHBOURS = 15
-"""Number of the nearest photographs that spatial matching pairs with each photograph."""
+ALIKE_NEIGHBOURS = 6
+"""Number of the most similar photographs that retrieval matches with each photograph in the first round."""
+NEAR_NEIGHBOURS = 6
+"""Number of the nearest photographs that spatial matching pairs with each photograph in the first round."""
+TRACK_NEIGHBOURS = 6
+"""Number of photographs with the most shared tracks that a second round of matching pairs with each photograph."""
+MIN_SHARED_TRACKS = 15
+"""Minimum number of tracks that two photographs share after the first round, to be matched in the second."""
 MIN_LOCATED_FRACTION = 0.9
 """Fraction of the photographs that must have a GPS position before "auto" chooses spatial matching."""
 MIN_GPS_EXTENT_M = 25.0
@@ -100,6 +103,38 @@ def spatial_distances(positions: NDArray[Any]) -> NDArray[np.float64]:
     """Return the distances of every two positions (N, N) from positions (N, 2); infinite where one is unknown."""
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
     return np.where(np.isfinite(apart), apart, np.inf)
+
+
+def shared_tracks(counts: Sequence[int], matches: Mapping[Pair, NDArray[Any]]) -> NDArray[np.int64]:
+    """Return the number of tracks that every two photographs share (N, N), 0 for a photograph with itself.
+
+    A track is a set of features that matches connect, directly or by way of other photographs.
+
+    counts: number of features of each photograph.
+    matches: for pairs of photographs, the matching features (M, 2), by their indices in each photograph.
+    """
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    ends = [first[list(pair)] + rows.astype(np.int64) for pair, rows in matches.items()]
+    one, two = np.concatenate([np.zeros((0, 2), np.int64), *ends]).T
+    joins = coo_array((np.ones(len(one), np.bool_), (one, two)), shape=(first[-1], first[-1]))
+    tracks, track = connected_components(joins, directed=False)
+    photo = np.repeat(np.arange(len(counts)), counts)
+    shown = np.unique(np.stack([photo, track]), axis=1)  # a photograph may show a track twice
+    seen = csr_array((np.ones(shown.shape[1], np.int64), (shown[0], shown[1])), shape=(len(counts), tracks))
+    shared = np.asarray((seen @ seen.T).todense())
+    np.fill_diagonal(shared, 0)
+    return shared
+
+
+def track_pairs(shared: NDArray[Any], matched: Iterable[Pair]) -> list[Pair]:
+    """Return the pairs of each photograph with those that share the most tracks, at most TRACK_NEIGHBOURS of them.
+
+    shared: from `shared_tracks`. matched: pairs that are left out, as they are matched already.
+    """
+    distances = np.where(shared >= MIN_SHARED_TRACKS, -shared.astype(np.float64), np.inf)
+    for one, two in matched:
+        distances[one, two] = distances[two, one] = np.inf
+    return nearest_pairs(distances, TRACK_NEIGHBOURS)
 
 
 def joined(*lists: Iterable[Pair]) -> list[Pair]:
