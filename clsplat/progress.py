@@ -261,7 +261,7 @@ class FrameProgress(LiveBar):
 class TaskProgress(LiveBar):
     """Progress of tasks. Call it with a `jobs.dispatcher.JobProgress` at intervals.
 
-    what: what the tasks are, in the plural, such as "tasks".
+    what: word for the tasks in the plural, such as "tasks".
     style: "auto": a bar or lines on standard error. "openjd": lines on standard output.
     """
 

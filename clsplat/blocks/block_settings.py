@@ -20,7 +20,7 @@ FINISH_COOLDOWN_TO = 0.2
 
 
 def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainConfig:
-    """Return the settings of a block's training: what remains of the whole's schedule after the coarse model's steps.
+    """Return the settings of a block's training: the rest of the whole's schedule after the coarse model's steps.
 
     coarse: settings of the coarse model.
 
@@ -88,7 +88,7 @@ def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
 
 
 def _for_fewer_photographs(optimiser: OptimiserConfig, times: float) -> OptimiserConfig:
-    """Return Adam's settings for a block, of whose photographs more show a Gaussian than of those of the whole.
+    """Return Adam's settings for a block, where a larger part of the photographs show a Gaussian than in the whole.
 
     times: number of the scene's photographs, as a multiple of the block's.
 

@@ -31,7 +31,7 @@ MERGED_COMMENT = "clsplat merged"
 
 @dataclass(frozen=True)
 class CellModel:
-    """Model file of a block, of which the merge takes the Gaussians of one cell."""
+    """Model file of a block. The merge takes its Gaussians in one cell."""
 
     path: Path
     cell: TrainedRegion

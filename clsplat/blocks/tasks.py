@@ -22,7 +22,7 @@ METRICS_END_BYTES = 1 << 16
 def tasks_of(city: Path, plan: BlockPlan, steps: int | None, machine: Sequence[str] = ()) -> list[JobTask]:
     """Return the tasks of a city.
 
-    steps: number of steps of the finish; None for those of the plan.
+    steps: number of steps of the finish; None for the plan's.
     machine: flags about device and memory, for the commands that train.
     """
     words, digest = ("clsplat", "blocks"), plan.digest

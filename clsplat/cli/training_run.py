@@ -32,7 +32,7 @@ TrainingProgress = Literal["auto", "openjd"]
 
 @dataclass(frozen=True)
 class TrainingMachine(SeveralDevices):
-    """The devices to train on, and limits and folders for what does not fit in memory."""
+    """The devices to train on, and limits and folders for data that does not fit in memory."""
 
     max_host_mem: Memory = None
     """Limit of main memory for photographs and Gaussians together, such as 4GiB. Photographs beyond it are read from
@@ -98,7 +98,7 @@ def train_run(
 ) -> None:
     """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
 
-    start: what the training begins with; None for Gaussians from the scene's points.
+    start: initial model, region and appearance; None for Gaussians from the scene's points.
     progress: how progress is written.
     page: function that returns a context manager, which serves the viewer's page; None without --view.
     """
@@ -125,7 +125,7 @@ def train_run(
                 scratch=machine.scratch,
                 run=run,
                 resume=run.resuming,
-                **({} if start is None else {"start": start}),
+                start=start,
                 on_plan=print_plan,
                 on_step=display,
                 between=between,

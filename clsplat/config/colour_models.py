@@ -66,8 +66,8 @@ def rise_in_short_training(steps: int) -> float:
 
 
 def appearance_rate_of_part(rate: float, kind: str, whole: int, part: int) -> float:
-    """Return the setting `appearance_rate` with which a training of `part` steps takes as large steps as one of `whole`
-    steps with `rate`: gains that moved as far in few steps would be random.
+    """Return the setting `appearance_rate` of a training of `part` steps, for steps as large as in a training of
+    `whole` steps with `rate`. Otherwise gains would move as far in few steps, and would be random.
 
     kind: the setting `appearance`.
     """

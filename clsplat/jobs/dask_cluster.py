@@ -76,8 +76,8 @@ def dask_client(scheduler: str | None, workers: int | None = None) -> Iterator[A
 def warning_of_no_workers(client: Any, scheduler: str | None, waiting: str) -> Iterator[None]:
     """Context manager that warns at once, and then at intervals, while the scheduler has no workers.
 
-    scheduler: its address; None for a local cluster, of which nothing is said.
-    waiting: what waits for workers, such as "frames".
+    scheduler: its address; None for a local cluster, which causes no warnings.
+    waiting: word for the tasks that wait for workers, such as "frames".
     """
     if scheduler is None:
         yield

@@ -62,7 +62,7 @@ class _Sent:
 
 
 class DaskEngine:
-    """Runs one attempt at a time on each worker of a cluster. The methods are those of `Engine`.
+    """Runs one attempt at a time on each worker of a cluster. Has the methods of `Engine`.
 
     If some workers declare the resource GPU_RESOURCE, only these are used, and each attempt takes one.
     scheduler: address of the scheduler, for messages.

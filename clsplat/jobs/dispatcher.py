@@ -91,7 +91,7 @@ def run_tasks(
 
 
 class _Dispatcher:
-    """Tasks by state, and what is known of their progress.
+    """Tasks by state, and their progress as far as it is known.
 
     done: number of tasks that are done. failed: why each failed task has failed, by name.
     """
@@ -227,7 +227,7 @@ class _Dispatcher:
         heapq.heappush(self._later, (now + CLAIM_CHECK_SECONDS, name))
 
     def _look(self) -> None:
-        """Read the progress of the running tasks, also of those that other dispatchers have started."""
+        """Read the progress of the running tasks, also if other dispatchers have started them."""
         for name in (*self._running, *self._claimed):
             self._see(name, self.tasks[name].progress())
 

@@ -14,7 +14,7 @@ from clsplat.process import MAX_SIGNAL_WAIT_SECONDS
 
 
 class LocalEngine:
-    """Runs up to `workers` attempts at once, each in a process of this machine. The methods are those of `Engine`."""
+    """Runs up to `workers` attempts at once, each in a process of this machine. Has the methods of `Engine`."""
 
     def __init__(self, workers: int = 1) -> None:
         if workers < 1:

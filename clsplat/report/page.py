@@ -94,8 +94,7 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
     use = numbers.run.config.mask_use
     if views > 0 and (listed or use != NO_MASKS):
         scene = scene if scene is not None else thumbnails.scene_of(numbers.run)
-    masks: list[MaskedPhotograph] = []
-    masked_count = 0
+    masks, masked_count = list[MaskedPhotograph](), 0
     if views > 0 and use != NO_MASKS and isinstance(scene, Scene):
         masks, masked_count = masked_photographs(scene, only_files=use.alpha == "blend")
     if listed and views > 0:

@@ -97,7 +97,7 @@ def held_out_looks(record: Mapping[str, Any] | None) -> Look:
 
 
 def entries_of(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Float64, Float64]:
-    """Return what the run in `folder` has learnt of photographs: their entries, and those of their lenses.
+    """Return the appearance that the run in `folder` has learnt: the entries of photographs and of lenses.
 
     names: the photographs' names.
     Returns arrays (photographs, model.entries) and (photographs, model.lens_entries). Raises InputError.

@@ -32,7 +32,7 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None, star
     """Scene with its length unit, start points and known depths; `scene` itself if it has them already.
 
     resumed: the run that continues, which keeps its length unit.
-    start: what the training begins with. With a model, it needs no points beyond the scene's.
+    start: initial model, region and appearance. With a model, it needs no points beyond the scene's.
     Raises InputError if training with its points, depths or refined cameras would fail.
     """
     scene.require_training_views()
@@ -93,7 +93,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool, s
 
     Unless training continues from a checkpoint, also warn of faults that `sanity_checks.of_scene` finds, and give
     points without colours the photographs' colours.
-    start: what the training begins with.
+    start: initial model, region and appearance.
 
     Raises InputError without `resume` if the run has been trained already, and with `resume` if its scene was another.
     """

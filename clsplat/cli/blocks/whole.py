@@ -172,7 +172,7 @@ def _as_tasks(verb: TrainVerb, plan: BlockPlan) -> None:
 
 @contextmanager
 def _engine(verb: TrainVerb) -> Iterator[Engine]:
-    """Context that yields what runs the tasks."""
+    """Context that yields the engine of the tasks."""
     if verb.blocks.scheduler is None:
         from clsplat.jobs.local_engine import LocalEngine
 

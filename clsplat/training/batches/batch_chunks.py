@@ -155,8 +155,8 @@ class BatchChunks:
         return values
 
     def _whole_chunks(self, numbers: NDArray[np.uint32]) -> Iterator[tuple[int, int, DeviceGaussians, DeviceArray]]:
-        """Yield the parts in which full chunks are on the device: the first row among these chunks, the end of the
-        rows, the parameters, and each chunk's place in their arrays."""
+        """Yield full chunks on the device, part by part: first row, end of the rows, parameters, and each chunk's place
+        in the arrays of the parameters."""
         model = self.model[0]
         if isinstance(model, DeviceGaussians):
             if len(numbers):

@@ -41,7 +41,7 @@ def incremental_models(
 
     photos: folder of the photographs. output: folder for the models, which is made.
     relaxed: accept smaller triangulation angles and fewer matches than by default.
-    by_gps: hold the cameras near their GPS positions, except for those that are far off. The model is in metres then.
+    by_gps: hold the cameras near their GPS positions, except for positions far off. The model is in metres then.
     placed: function that is called after each photograph that is added to the first two.
     """
     options = _incremental_options(threads, seed, relaxed=relaxed)
