@@ -16,9 +16,13 @@ def test_the_coarse_model_has_a_shorter_schedule_at_half_the_size() -> None:
     assert (coarse.iterations, coarse.resolution, coarse.seed, coarse.eval_at) == (4500, 800, 4, ())
     assert coarse.warmup == (38, 75)
     assert (coarse.sh_degree_every, coarse.optimiser.means_rate_steps) == (150, 4500)
-    # densifications are 100 * sqrt(0.15) steps apart
-    assert (coarse.density.start, coarse.density.stop, coarse.density.every) == (75, 2250, 39)
+    assert (coarse.density.start, coarse.density.stop, coarse.density.every) == (75, 2250, 100)
     assert coarse.density.opacity_reset_every == 0
+
+
+def test_a_short_schedule_still_has_eight_densifications() -> None:
+    coarse = coarse_settings(bundled("default", "short", 3000), 800)
+    assert (coarse.density.start, coarse.density.stop, coarse.density.every) == (75, 321, 30)  # 246 steps
 
 
 def test_other_kinds_of_density_control() -> None:

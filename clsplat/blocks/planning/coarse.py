@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import sqrt
 
 from clsplat.config.colour_models import appearance_rate_of_part
 from clsplat.config.presets import STEP_SETTINGS, stretched
@@ -14,6 +13,8 @@ COARSE_STEPS_SHARE = 0.15
 """Steps of the coarse model's training, as a fraction of the steps of the whole."""
 COARSE_SIZE = 0.5
 """Size of the photographs from which the coarse model is trained, as a fraction of their size in the whole."""
+MIN_DENSIFICATIONS = 8
+"""Least number of densifications of the coarse model, if its schedule has as many steps between start and stop."""
 FINISH_STEPS_SHARE = 0.05
 """Steps over all photographs after the merge, as a fraction of the steps of the whole."""
 
@@ -23,15 +24,15 @@ def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
 
     config: settings of the training of the whole.
     longest: longest side of the photographs at the size of the whole, in pixels.
-    The schedule is shortened, with three exceptions. The steps between densifications are multiplied only by the root
-    of the factor, which leaves about a quarter of the Gaussians of the whole, as half the size asks for. Opacities are
-    never reset, because there is no time to recover from it. Gains take steps as large as in the whole's training: a
-    short training would take larger ones, too large for the few steps in which a photograph is shown.
+    The schedule is shortened, with three exceptions. The number of steps between densifications stays, unless there
+    would be fewer than MIN_DENSIFICATIONS. Opacities are never reset, because there is no time to recover from it.
+    Gains take steps as large as in the whole's training: a short training would take larger ones, too large for the few
+    steps in which a photograph is shown.
     """
-    steps = coarse_steps(config)
-    short = stretched(config, steps, [name for name in STEP_SETTINGS if name != "density.every"])
-    every = round(config.density.every * sqrt(steps / config.iterations))
-    density = replace(short.density, opacity_reset_every=0, every=max(every, 1) if config.density.every else 0)
+    short = stretched(config, coarse_steps(config), [name for name in STEP_SETTINGS if name != "density.every"])
+    span = short.density.stop - short.density.start
+    every = min(short.density.every, max(span // MIN_DENSIFICATIONS, 1))
+    density = replace(short.density, opacity_reset_every=0, every=every)
     if density.fills:  # pictures of half the size show a quarter of the pixels
         density = replace(density, max_gaussians=max(round(COARSE_SIZE**2 * density.max_gaussians), 1))
     return replace(
