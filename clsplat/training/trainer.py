@@ -406,10 +406,8 @@ class Trainer:
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
-        lengths, random = (self.scene.length_unit, self.scene.extent), self.position.rng
-        return ModelState(
-            model.count, step, *lengths, model.arrays, statistics, random, self.model.marker(), self.region
-        )
+        sizes, arrays = (model.count, step, self.scene.length_unit, self.scene.extent), (model.arrays, statistics)
+        return ModelState(*sizes, *arrays, self.position.rng, self.model.marker(), self.region)
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out a plan of density control, or of a repair, on the rows of all arrays."""
