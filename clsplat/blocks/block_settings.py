@@ -88,14 +88,14 @@ def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
 
 
 def _for_fewer_photographs(optimiser: OptimiserConfig, times: float) -> OptimiserConfig:
-    """Return Adam's settings for a block, where a larger part of the photographs show a Gaussian than in the whole.
+    """Return Adam's settings for a block, where a larger fraction of the photographs shows a Gaussian.
 
     times: number of the scene's photographs, as a multiple of the block's.
 
-    In a training of the whole, a Gaussian has zero gradients in all steps that do not show it. They make Adam's second
-    moment smaller by `times`, and so the change by a view that shows the Gaussian larger by the root. A block has few
-    such steps, so its learning rates are multiplied by the root, and moments decay as much per pass. Sparse Adam
-    leaves out such steps everywhere.
+    In a training of the whole, a Gaussian has zero gradients in all steps that do not show it. These zeros divide
+    Adam's second moment by about `times`. A view that shows the Gaussian then changes it more, by the root of `times`.
+    A block has few zeros, so its learning rates are multiplied by the root. Moments decay as much in a pass as in the
+    whole. With sparse Adam there are no zeros in either training, so nothing changes.
     """
     if optimiser.sparse:
         return optimiser

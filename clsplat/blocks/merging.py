@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The merge of the blocks' models: of each block, the Gaussians whose means lie in its own cell.
 
-Cells are half-open and cover the plane, so each place on the ground belongs to one block. A Gaussian that a block has
-moved out of its own cell is left out: the block of the other cell has Gaussians of its own there.
+Cells are half-open and cover the plane, so each place on the ground belongs to one block. Gaussians outside the cell of
+their block are left out, because another block has Gaussians of its own there.
 """
 
 from __future__ import annotations

@@ -236,7 +236,7 @@ DEPTH_LOSS_CASE = Case(
 
 
 def of_depth(bench: CaseBench) -> StageOutcome:
-    """Test the nearness of the scene, and the depth loss with synthetic known depths. A quarter of the depths is missing.
+    """Test the nearness of the scene, and the depth loss with synthetic known depths. A quarter of them is missing.
 
     The digest leaves out the gradients of pairs, because the order of their sums depends on the kernel shape.
     """
