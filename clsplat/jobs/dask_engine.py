@@ -6,9 +6,10 @@ from __future__ import annotations
 import queue
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from typing import Any
 
 from clsplat.errors import ClsplatError
@@ -43,6 +44,20 @@ def run_on_worker(key: str, document: dict[str, Any]) -> dict[str, Any]:
         return asdict(process.wait())
     finally:
         del _attempts_here[key]
+
+
+def by_value() -> Callable[[str, dict[str, Any]], dict[str, Any]]:
+    """A function that imports and calls `run_on_worker`.
+
+    Dask sends a nested function by value. So a scheduler needs no clsplat, and a worker that has another version of it
+    answers with an error instead of leaving the cluster.
+    """
+
+    def call(key: str, document: dict[str, Any]) -> dict[str, Any]:
+        outcome: dict[str, Any] = import_module("clsplat.jobs.dask_engine").run_on_worker(key, document)
+        return outcome
+
+    return call
 
 
 def end_on_worker(keys: list[str], *, kill: bool = False) -> None:
@@ -87,7 +102,7 @@ class DaskEngine:
         key = f"clsplat-{attempt.name}-{secrets.token_hex(6)}"
         with self._reaching():
             future = self._client.submit(
-                run_on_worker,
+                by_value(),
                 key,
                 attempt.document(),
                 key=key,

@@ -115,9 +115,8 @@ def test_workers_that_are_left_out(
     script.write_text(f"import os, subprocess, sys\nif os.environ.get('DISK_IS_FULL'):\n    {code}\n")
     with script.open("a") as file:
         file.write("sys.exit(subprocess.call([sys.executable, *sys.argv[1:]]))\n")
-    cluster.kill("b")
     cluster.start_worker("full", environment={"DISK_IS_FULL": "1"})
-    wait_for_workers(cluster, 2)
+    wait_for_workers(cluster, 3)
 
     def task(number: int) -> JobTask:
         one = counting_task(tmp_path, str(number), 3)
@@ -130,6 +129,20 @@ def test_workers_that_are_left_out(
     assert len(told) == 1
     assert "/scratch/x: cannot be written: the disk is full; it is left out, and " in told[0]
     assert told[0].startswith("worker tcp://127.0.0.1:")
+
+
+def test_a_worker_without_this_room(tmp_path: Path, cluster: DaskProcesses, told: list[str]) -> None:
+    """As of an earlier version: it is left out, with what it says."""
+    earlier = tmp_path / "earlier" / "clsplat"
+    earlier.mkdir(parents=True)
+    (earlier / "__init__.py").touch()
+    cluster.start_worker("earlier", environment={"PYTHONPATH": str(earlier.parent)})
+    wait_for_workers(cluster, 3)
+    tasks = [counting_task(tmp_path, str(number), 3) for number in range(4)]
+    with dask_engine.dask_engine(cluster.address) as engine:
+        run_tasks(tasks, engine, tmp_path / "jobs")
+    assert all(task.is_done() for task in tasks)
+    assert len(told) == 1 and "has no clsplat of this version: " in told[0]
 
 
 def test_no_worker_sees_the_scene(tmp_path: Path, cluster: DaskProcesses, told: list[str]) -> None:

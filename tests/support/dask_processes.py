@@ -52,6 +52,7 @@ class DaskProcesses:
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
+                cwd=self.folder,  # `python -m` imports from there first
                 env={**os.environ, **(environment or {})},
             )
         self.processes[name] = process
