@@ -39,7 +39,8 @@ def trainer(services: Services, machine: TrainingMachine, progress: TrainingProg
     opened = machine.open_all(services)
 
     def train(scene: Scene, run: Run, start: Start) -> None:
-        devices = [services.require(device, stages_of_training(run.config)) for device in opened]
+        stages = stages_of_training(run.config, region=start.region is not None)
+        devices = [services.require(device, stages) for device in opened]
         run.resume_command = shlex.join([*shlex.split(run.resume_command), *machine.flags])
         tell_of_training(scene, run.config, devices)
         train_run(services, scene, run, devices, machine, start=start, progress=progress)
