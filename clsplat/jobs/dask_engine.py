@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from typing import Any
 
 from clsplat.errors import ClsplatError
@@ -53,9 +54,8 @@ def by_value() -> Callable[[str, dict[str, Any]], dict[str, Any]]:
     """
 
     def call(key: str, document: dict[str, Any]) -> dict[str, Any]:
-        from clsplat.jobs.dask_engine import run_on_worker as run
-
-        return run(key, document)
+        outcome: dict[str, Any] = import_module("clsplat.jobs.dask_engine").run_on_worker(key, document)
+        return outcome
 
     return call
 

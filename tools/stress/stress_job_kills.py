@@ -42,6 +42,8 @@ EARLY_SHARE, EARLY_SECONDS = 0.25, 6.0
 """Share of kills that do not wait for progress, and the longest time after which they come."""
 KILL_SECONDS = 1.5
 """Longest time from progress to a kill."""
+FINISH_SECONDS = 1200.0
+"""Seconds that the tasks have to end after the last kill."""
 RESULTS = ("*.count", "merged.ply", "model.ply", "blocks/*/model.ply")
 """Patterns of the files that are compared."""
 _ATTEMPT = re.compile(r"^--- .*, process (\d+): ", re.MULTILINE)
@@ -141,15 +143,15 @@ class Killer:
             self.kills[kind] += 1
 
     def finish(self) -> int:
-        """Let the tasks end. Returns the dispatcher's exit status."""
-        status = 1
-        for _ in range(5):  # three tries without progress, all killed, may have ended the running dispatcher
-            self._start()
+        """Let the tasks end. Returns 0, or 1 if they have not ended after FINISH_SECONDS."""
+        until = time.monotonic() + FINISH_SECONDS
+        while time.monotonic() < until:
+            self._start()  # three killed tries may end a dispatcher, and workers end after their scheduler
             assert self.dispatcher is not None
-            status = self.dispatcher.wait(600)
-            if status == 0:
-                break
-        return status
+            with suppress(subprocess.TimeoutExpired):
+                if self.dispatcher.wait(1.0) == 0:
+                    return 0
+        return 1
 
     def logs(self) -> list[Path]:
         """The tasks' logs."""
