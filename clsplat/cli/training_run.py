@@ -6,7 +6,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
@@ -55,6 +56,19 @@ class TrainingMachine(SeveralDevices):
         from clsplat.training.memory import HostMemory
 
         HostMemory.chosen(self.max_host_mem, self.cache, None, self.scratch).check(scene, config, device)
+
+    def in_any_folder(self) -> TrainingMachine:
+        """Return the same options with absolute paths, for commands that run in other folders."""
+
+        def absolute(folder: str) -> str:
+            return str(Path(folder).absolute())
+
+        cache, scratch = self.cache, self.scratch
+        return replace(
+            self,
+            cache=cache if cache in (None, "none") else absolute(cache),
+            scratch=None if scratch is None else absolute(scratch),
+        )
 
     @property
     def flags(self) -> list[str]:

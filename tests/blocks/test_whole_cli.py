@@ -14,6 +14,7 @@ from calls import Capture, rejected
 from clsplat.blocks.plan import read_plan
 from clsplat.cli.main import main
 from clsplat.cli.session import Services
+from clsplat.cli.training_run import TrainingMachine
 from clsplat.runs.run import Run
 
 SETTINGS = ("--iterations", "60", "--random-points", "200", "--warmup", "4", "--density.start", "10", "--no-report")
@@ -152,3 +153,11 @@ def test_the_plan_of_the_command_is_that_of_blocks_plan(whole: Path, small_scene
     words = ["blocks", "plan", str(small_scene), "-o", str(city), *SETTINGS, "--blocks", "2", "--device", "cpu"]
     assert main(words) == 0
     assert read_plan(city) == read_plan(whole)
+
+
+def test_folders_of_other_processes_are_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker of a cluster has another current folder."""
+    monkeypatch.chdir(tmp_path)
+    flags = TrainingMachine("cpu", cache="none", scratch="rows").in_any_folder().flags
+    assert flags == ["--device", "cpu", "--cache", "none", "--scratch", str(tmp_path / "rows")]
+    assert TrainingMachine().in_any_folder().flags == []

@@ -164,7 +164,7 @@ def _as_tasks(verb: TrainVerb, plan: BlockPlan) -> None:
     from clsplat.blocks.tasks import tasks_of
     from clsplat.jobs.dispatcher import run_tasks
 
-    tasks = tasks_of(verb.output, plan, verb.blocks.finish, verb.device.flags)
+    tasks = tasks_of(verb.output, plan, verb.blocks.finish, verb.device.in_any_folder().flags)
     with _engine(verb) as engine, TaskProgress("tasks") as progress:
         needs = [plan.scene, verb.output]
         run_tasks(tasks, engine, verb.output / JOBS_FOLDER, progress, needs=needs)
