@@ -117,6 +117,7 @@ def train_run(
     page: function that returns a context manager, which serves the viewer's page; None without --view.
     """
     from clsplat.training.forecast import Forecast
+    from clsplat.training.start import NO_START
 
     views = scene.train_views
     pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
@@ -139,7 +140,7 @@ def train_run(
                 scratch=machine.scratch,
                 run=run,
                 resume=run.resuming,
-                start=start,
+                start=start or NO_START,
                 on_plan=print_plan,
                 on_step=display,
                 between=between,

@@ -27,6 +27,7 @@ from clsplat.scenes.dataset import SOURCE_FRAME
 from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read
+from clsplat.training.start import NO_START, Start
 
 
 def camera(width: int = 32, height: int = 24) -> Camera:
@@ -169,10 +170,12 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         scratch: str | None,
         run: Run,
         resume: bool,
+        start: Start,
         on_step: Any,
         on_plan: Any,
         between: Any = None,
     ) -> Gaussians:
+        assert start == NO_START
         pipe.calls.append(("train", config.iterations, config.seed, resume))
         on_step(Report(1))
         pipe.training(run, on_step)
