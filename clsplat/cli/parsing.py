@@ -47,8 +47,8 @@ VERBS = {
     "compare": "Compare runs in a table: scores, Gaussians, times, and the settings that differ.",
     "convert": "Convert a model to the format of the output file's ending, with optional edits, and report rounding "
     "errors.",
-    "info": "Describe a model file: format, count, SH, bounds, scales, opacities, colour space and values that are "
-    "not finite.",
+    "info": "Describe a model file: format, count, SH, bounds, scales, opacities, colour space, place on the earth "
+    "and values that are not finite.",
     "bench": "Measure each stage of a frame and of a training step, and the limits of the device in the same run.",
     "tune": "Find a device's quickest kernel shape by a short trial, and save it for later runs.",
     "selftest": "Test every device: build the kernels, compare each stage with its float64 "
