@@ -6,7 +6,6 @@ import json
 import shutil
 import sqlite3
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -235,33 +234,6 @@ def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threa
     assert {options.num_threads for options in given if hasattr(options, "num_threads")} == {threads}
     if mapper == "global":
         assert given[-2].mapper.num_threads == threads
-
-
-@pytest.mark.parametrize(
-    ("cameras", "at_once", "tried"),
-    [
-        (1, 50, ["one by one"]),
-        (10, 50, ["one by one", "at once"]),  # 5 photographs of a camera
-        (11, 50, ["at once"]),
-        (11, 15, ["at once"]),  # 30 %
-        (11, 14, ["at once", "one by one", "relaxed"]),
-    ],
-)
-def test_photographs_of_many_cameras_are_placed_at_once_first(cameras, at_once, tried, tmp_path, monkeypatch):
-    names, done = [f"{index}.jpg" for index in range(50)], []
-    placed = {"at once": at_once, "one by one": 50 if cameras == 1 else 29, "relaxed": 0}
-
-    def models(way):
-        done.append(way)
-        return {tmp_path / way: SimpleNamespace(num_reg_images=lambda: placed[way])}
-
-    groups = [names[start::cameras] for start in range(cameras)]
-    task = {"photos": tmp_path, "work": tmp_path, "groups": groups, "mapper": "auto"}
-    work = worker.Worker(task, io.StringIO())
-    monkeypatch.setattr(work, "solve_at_once", lambda: models("at once"))
-    monkeypatch.setattr(work, "add_one_by_one", lambda *, relaxed: models("relaxed" if relaxed else "one by one"))
-    work.map()
-    assert done == tried
 
 
 @pytest.mark.slow

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 
+from clsplat.scenes.sfm import worker
 from clsplat.scenes.sfm.pipeline import mapping
 
 PHOTOS = 8
@@ -133,3 +137,32 @@ def test_points_of_two_photographs_are_added(tmp_path: Path, *, relaxed: bool) -
     }
     assert {camera: found.cameras[camera].params.tolist() for camera in lenses} == lenses
     assert found.compute_mean_reprojection_error() < 1e-3  # the synthetic features have no noise
+
+
+@pytest.mark.parametrize(
+    ("cameras", "at_once", "tried"),
+    [
+        (1, 50, ["one by one"]),
+        (10, 50, ["one by one", "at once"]),  # 5 photographs of a camera
+        (11, 50, ["at once"]),
+        (11, 15, ["at once"]),  # 30 %
+        (11, 14, ["at once", "one by one", "relaxed"]),
+    ],
+)
+def test_photographs_of_many_cameras_are_placed_at_once_first(
+    cameras: int, at_once: int, tried: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, done = [f"{index}.jpg" for index in range(50)], list[str]()
+    placed = {"at once": at_once, "one by one": 50 if cameras == 1 else 29, "relaxed": 0}
+
+    def models(way: str) -> dict[Path, Any]:
+        done.append(way)
+        return {tmp_path / way: SimpleNamespace(num_reg_images=lambda: placed[way])}
+
+    groups = [names[start::cameras] for start in range(cameras)]
+    task = {"photos": tmp_path, "work": tmp_path, "groups": groups, "mapper": "auto"}
+    work = worker.Worker(task, io.StringIO())
+    monkeypatch.setattr(work, "solve_at_once", lambda: models("at once"))
+    monkeypatch.setattr(work, "add_one_by_one", lambda *, relaxed: models("relaxed" if relaxed else "one by one"))
+    work.map()
+    assert done == tried
