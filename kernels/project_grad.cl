@@ -12,9 +12,8 @@
 //   contributions (n), with CONTRIBUTIONS: each Gaussian's blending weights, summed over all pixels.
 //   by_lens (n, 4), with LENS: each Gaussian's gradient with respect to the logs of the focal lengths and, per pixel,
 //     to the principal point.
-//   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians. With CHUNKS
-//     (shared/chunks.h) they have the rows of the launch.
-//   With REGION (shared/region.h) visible Gaussians outside the region have gradients of zero.
+//   project_grad writes gradients in the parameters' shapes, with CHUNKS (shared/chunks.h) those of the launch, but no
+//     rows of invisible Gaussians. With REGION (shared/region.h) visible ones outside the region have zeros.
 //   PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2), with the opacity o and the scales
 //     s_k.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and

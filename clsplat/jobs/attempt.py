@@ -67,7 +67,7 @@ def unfit_reason(attempt: Attempt) -> str:
         return f"does not see {examples(unseen)}, expected the same paths as on the dispatcher's machine"
     mark = Path(attempt.folder) / MARK_FILE_NAME
     try:
-        same = mark.read_text("ascii", errors="replace") == attempt.mark
+        same = mark.read_text(encoding="ascii", errors="replace") == attempt.mark
     except OSError:
         return f"does not see {attempt.folder}, expected the same paths as on the dispatcher's machine"
     return "" if same else f"sees another folder as {attempt.folder} than the dispatcher, expected a shared folder"

@@ -152,7 +152,7 @@ def mark_of(folder: Path) -> str:
         with briefly_locked(path):  # another dispatcher may write it at the same time
             if not path.exists():
                 atomic_write(path, secrets.token_hex(16).encode())
-    return path.read_text("ascii", errors="replace")
+    return path.read_text(encoding="ascii", errors="replace")
 
 
 def log_path(folder: str | Path, name: str) -> Path:

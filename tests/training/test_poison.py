@@ -24,7 +24,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.training.step import gradient_step as step_module
 from clsplat.training.step.gradient_step import GradientStep
-from clsplat.training.step.inputs import StepRows
+from clsplat.training.step.inputs import StepRows, ViewInputs
 from clsplat.training.trainer import Trainer
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -162,13 +162,13 @@ def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: s
         monkeypatch.setattr(GradientStep, "run", run)
         return run(self, *arguments[:3], gradients, **named)
 
-    def poisoned(self: GradientStep, rows: StepRows) -> None:
+    def poisoned(self: GradientStep, rows: StepRows, inputs: ViewInputs) -> None:
         if self.device.only_tries:
-            update(self, rows)
+            update(self, rows, inputs)
             return
         put(gradients[group], value)
         monkeypatch.setattr(GradientStep, "update", update)
-        update(self, rows)
+        update(self, rows, inputs)
         assert not any(gradients[each].get().any() for each in PARAMETER_GROUPS)
 
     monkeypatch.setattr(GradientStep, "run", looked_at)
