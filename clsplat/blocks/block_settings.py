@@ -19,10 +19,11 @@ FINISH_COOLDOWN_TO = 0.2
 """Fraction of every learning rate that is left at the end of the finish."""
 
 
-def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainConfig:
+def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, surroundings: int) -> TrainConfig:
     """Return the settings of a block's training: the rest of the whole's schedule after the coarse model's steps.
 
     coarse: settings of the coarse model.
+    surroundings: number of Gaussians outside the widened cell, which are drawn and stay as they are.
 
     Steps of the schedule are scaled by the block's fraction of the photographs, so that a densification sees the same
     fraction of them as in a training of the whole. The SH degree is full from the start, photographs have their full
@@ -38,7 +39,6 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainC
     def scaled(steps: int) -> int:
         return max(round(steps * scale), 1) if steps else 0
 
-    frozen = plan.gaussians - block.gaussians
     inside = max(round(block.gaussians / plan.gaussians * density.max_gaussians), block.gaussians)
     return replace(
         _without_events(whole, photographs=plan.photographs),
@@ -58,7 +58,7 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainC
             stop=left(density.stop),
             opacity_reset_every=0,
             prune_every=scaled(density.prune_every),
-            max_gaussians=frozen + inside,
+            max_gaussians=surroundings + inside,
         ),
     )
 

@@ -18,6 +18,7 @@ from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of, r
 from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, BlockPlan, read_plan
 from clsplat.blocks.plan_check import check_plan
 from clsplat.blocks.progress_records import CITY_FILES, MERGED_FILE, check_begun, is_done, keep_done
+from clsplat.blocks.surroundings import first_model_of_block
 from clsplat.config.orientation import FrameUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
@@ -54,12 +55,13 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         coarse = Run.open(city / COARSE_FOLDER)
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene, photographs=block.photographs)
-        model = Gaussians.load(coarse.model_path)
-        config = block_settings(plan, block, coarse.config).on_devices(devices, explicit=False)
+        part, region = scene_of_block(scene, block, coarse), region_of(plan, block.widened)
+        model = first_model_of_block(coarse.model_path, region, part, plan.settings)
+        surroundings = len(model) - block.gaussians
+        config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)
         run = Run.create(folder, config, scene=plan.scene, resume=is_run(folder), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "train", str(city), "--block", name])
-        start = Start(model, region_of(plan, block.widened), _with_appearance(coarse))
-        train(scene_of_block(scene, block, coarse), run, start)
+        train(part, run, Start(model, region, _with_appearance(coarse)))
         keep_done(folder, plan.digest, plan.coarse)
     return True
 

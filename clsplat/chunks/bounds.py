@@ -46,9 +46,12 @@ class ChunkBounds:
     factor: float = 1.0
 
     @classmethod
-    def measured(cls, means: Float32, log_scales: Float32) -> ChunkBounds:
-        """Return the bounds of the chunks of a model, given means and log scales (n, 3). NaNs give bounds of NaN."""
-        starts = np.arange(0, len(means), CHUNK_ROWS)
+    def measured(cls, means: Float32, log_scales: Float32, rows: int = CHUNK_ROWS) -> ChunkBounds:
+        """Return the bounds of the chunks of a model, given means and log scales (n, 3). NaNs give bounds of NaN.
+
+        rows: number of Gaussians in a chunk.
+        """
+        starts = np.arange(0, len(means), rows)
         if len(starts) == 0:
             return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         lowest, highest = np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts)

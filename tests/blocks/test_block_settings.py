@@ -42,7 +42,7 @@ def plan_of(whole: TrainConfig, share: int = 100) -> BlockPlan:
 
 def settings(whole: TrainConfig = WHOLE, share: int = 100) -> TrainConfig:
     plan = plan_of(whole, share)
-    found = block_settings(plan, plan.blocks[0], COARSE)
+    found = block_settings(plan, plan.blocks[0], COARSE, surroundings=2000)
     found.check()
     return found
 
@@ -75,18 +75,18 @@ def test_sparse_adam_has_the_rates_of_the_whole() -> None:
 
 
 def test_a_block_has_its_share_of_the_gaussians() -> None:
-    """A third of 12,000 inside, and 6000 frozen ones; never fewer inside than the coarse model has."""
+    """A third of 12,000 inside, and 2000 frozen ones; never fewer inside than the coarse model has."""
     limited = replace(WHOLE, density=replace(WHOLE.density, max_gaussians=12_000))
-    assert settings(limited).density.max_gaussians == 4000 + 6000
+    assert settings(limited).density.max_gaussians == 4000 + 2000
     few = replace(WHOLE, density=replace(WHOLE.density, max_gaussians=300))
-    assert settings(few).density.max_gaussians == 9000
+    assert settings(few).density.max_gaussians == 3000 + 2000
 
 
 @pytest.mark.parametrize(("photographs", "photos"), [(400, "8bit"), (200, "exact")])
 def test_photographs_are_rounded_as_in_the_whole(photographs: int, photos: str) -> None:
     """The whole's number of photographs decides, not the block's."""
     plan = replace(plan_of(WHOLE), photographs=photographs)
-    assert block_settings(plan, plan.blocks[0], COARSE).photos == photos
+    assert block_settings(plan, plan.blocks[0], COARSE, 0).photos == photos
     assert finish_settings(plan, 10).photos == photos
 
 

@@ -154,10 +154,8 @@ def no_surroundings() -> Iterator[None]:
         inside = take(model, region.contains(model.means, model.origin))
         return Start(inside, None, *rest, **named)  # type: ignore[arg-type]
 
-    def without_frozen(plan: BlockPlan, block: Block, coarse: TrainConfig) -> TrainConfig:
-        config = block_settings(plan, block, coarse)
-        most = config.density.max_gaussians - (plan.gaussians - block.gaussians)
-        return replace(config, density=replace(config.density, max_gaussians=most))
+    def without_frozen(plan: BlockPlan, block: Block, coarse: TrainConfig, _surroundings: int) -> TrainConfig:
+        return block_settings(plan, block, coarse, 0)
 
     with (
         patch.object(block_training, "Start", start),
