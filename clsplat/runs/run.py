@@ -115,8 +115,9 @@ class Run:
                 for file in owned_files(path):
                     remove(file)
             run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
-            run.checkpoints_path.mkdir(exist_ok=True)
+            # first, so that a folder in which the disk became full is a run, and the same command goes on
             atomic_write(run.config_path, config_text(config, run.scene).encode())
+            run.checkpoints_path.mkdir(exist_ok=True)
         return run
 
     @classmethod

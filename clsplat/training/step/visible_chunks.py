@@ -205,7 +205,8 @@ class VisibleChunks(Component):
             found[there] = self._measured_on_device(gaussians.in_pool, slots[there].astype(np.uint32))
         for place in np.flatnonzero(~there):
             rows = store.starts[numbers[place] : numbers[place] + 2].tolist()
-            one = ChunkBounds.measured(*(store.get_rows(f"parameters/{group}", *rows) for group in _BOUNDED_GROUPS))
+            means, log_scales = (store.get_rows(f"parameters/{group}", *rows) for group in _BOUNDED_GROUPS)
+            one = ChunkBounds.measured(means, log_scales)
             found[place] = np.concatenate([one.lowest[0], one.highest[0], one.largest])
         return found
 
