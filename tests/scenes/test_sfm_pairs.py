@@ -218,3 +218,27 @@ def test_pairs_of_the_second_round_are_read_from_the_database(tmp_path):
     assert sfm_database.feature_counts(path) == {one: count, two: count, three: count, four: 0}
     assert sfm_database.verified_matches(path).keys() == {(one, two), (two, three)}
     assert matching.overlapping_pairs(path, [(one, two), (two, three), (three, four)]) == [(one, three)]
+
+
+def test_photographs_outside_the_largest_group():
+    assert pairs.unconnected(6, [(0, 1), (1, 2), (4, 5)]) == [3, 4, 5]
+    assert pairs.unconnected(3, [(0, 1), (1, 2)]) == []
+    assert pairs.unconnected(1, []) == []
+
+
+def test_wrong_positions_are_mended_by_similarity(database, tmp_path, monkeypatch):
+    """Three neighbours whose GPS is 1 km off match each other alone; they are paired with what looks like them."""
+    positions = np.stack([np.arange(60) * 10.0, np.zeros(60)], axis=1)
+    positions[30:33] += 1000
+    database[:] = positions
+    chosen, found = matching.matched_pairs(tmp_path, "auto", [], 0)
+    assert chosen == "spatial"
+    wrong = {31, 32, 33}
+    verified = {pair: rows_of((0, 0)) for pair in found if len(wrong.intersection(pair)) != 1}
+    monkeypatch.setattr(matching.sfm_database, "verified_matches", lambda _: verified)
+    more = matching.pairs_of_unconnected(tmp_path, found, 0)
+    assert {(11, 31), (31, 51), (12, 32), (13, 33)} <= set(more)  # those 20 apart show the same
+    assert all(wrong.intersection(pair) for pair in more)
+    assert not set(more).intersection(found)
+    monkeypatch.setattr(matching.sfm_database, "verified_matches", lambda _: dict.fromkeys(found, rows_of((0, 0))))
+    assert matching.pairs_of_unconnected(tmp_path, found, 0) == []

@@ -27,7 +27,7 @@ from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm.pipeline import aliked, mapping, matching
 from clsplat.scenes.sfm.pipeline.database import feature_evidence, keep_largest, renumber_by_name
 from clsplat.scenes.sfm.pipeline.features import extract_sift
-from clsplat.scenes.sfm.pipeline.photo_pairs import MAX_EXHAUSTIVE_PHOTOS, Pair
+from clsplat.scenes.sfm.pipeline.photo_pairs import MAX_EXHAUSTIVE_PHOTOS, Pair, joined
 from clsplat.scenes.sfm.worker_progress import UNDISTORTED_IMAGES
 
 MAX_SINGLE_THREAD_PHOTOS = 80
@@ -156,6 +156,7 @@ class Worker:
         """Match and verify the features of the chosen pairs. Returns the matching and its number of pairs.
 
         Spatial matching and retrieval have a second round, with pairs that show the same by the matches of the first.
+        After spatial matching it also has pairs by similarity, for photographs whose GPS position may be wrong.
         """
         seed = self.task["seed"]
         self.begin("pairs", None)
@@ -164,6 +165,8 @@ class Worker:
         if chosen in TWO_ROUND_MATCHINGS:
             self.begin("more pairs", None)
             more = matching.overlapping_pairs(self.database, pairs)
+            if chosen == "spatial":
+                more = joined(more, matching.pairs_of_unconnected(self.database, pairs, seed))
             if more:
                 self.match_pairs(more, before=len(pairs))
             pairs += more

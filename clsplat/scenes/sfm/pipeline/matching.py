@@ -80,6 +80,24 @@ def overlapping_pairs(database: Path, pairs: Sequence[Pair]) -> list[Pair]:
     return [(ids[one], ids[two]) for one, two in more]
 
 
+def pairs_of_unconnected(database: Path, pairs: Sequence[Pair], seed: int) -> list[Pair]:
+    """Return pairs by similarity for the photographs that no matches connect to most others, as with a wrong position.
+
+    pairs: numbers of the photographs that are matched already. The result has such numbers too.
+    seed: seed of the clustering in `photo_pairs.image_similarity`.
+    """
+    ids = list(sfm_database.image_names(database))
+    place = {image: at for at, image in enumerate(ids)}
+    verified = sfm_database.verified_matches(database)
+    lone = {ids[at] for at in sfm_pairs.unconnected(len(ids), [(place[one], place[two]) for one, two in verified])}
+    if not lone:
+        return []
+    rows = sfm_database.largest_descriptors(database, ids, sfm_pairs.RETRIEVAL_FEATURES)
+    found = sfm_pairs.nearest_pairs(1 - sfm_pairs.image_similarity(rows, seed), sfm_pairs.LOOP_NEIGHBOURS)
+    alike = {(ids[one], ids[two]) for one, two in found}
+    return sorted(pair for pair in alike.difference(pairs) if not lone.isdisjoint(pair))
+
+
 def verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
     """Return options with which verifying a pair's matches takes half as long as with pycolmap's defaults.
 

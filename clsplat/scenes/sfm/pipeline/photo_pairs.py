@@ -137,6 +137,17 @@ def track_pairs(shared: NDArray[Any], matched: Iterable[Pair]) -> list[Pair]:
     return nearest_pairs(distances, TRACK_NEIGHBOURS)
 
 
+def unconnected(count: int, verified: Iterable[Pair]) -> list[int]:
+    """Return the photographs that verified matches do not connect to the largest group of photographs.
+
+    count: number of photographs. verified: pairs with verified matches.
+    """
+    pairs = np.array(sorted(verified), np.int64).reshape(-1, 2)
+    joins = coo_array((np.ones(len(pairs), np.bool_), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    _, group = connected_components(joins, directed=False)
+    return [int(photo) for photo in np.flatnonzero(group != np.argmax(np.bincount(group)))]
+
+
 def joined(*lists: Iterable[Pair]) -> list[Pair]:
     """Return the pairs of several lists, sorted, each once."""
     return _sorted(pair for pairs in lists for pair in pairs)
