@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
+from scipy.sparse import csr_array
 
 from clsplat.scenes.sfm.pipeline import database as sfm_database
 from clsplat.scenes.sfm.pipeline import matching
@@ -34,16 +35,31 @@ def test_the_order_of_a_video_counts():
 
 def test_nearest_on_a_line():
     positions = np.stack([np.arange(5.0) ** 2, np.zeros(5)], axis=1)  # at 0, 1, 4, 9, 16: each nearer to the one before
-    assert pairs.nearest_pairs(pairs.spatial_distances(positions), 1) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert pairs.near_pairs(positions, 1) == [(0, 1), (1, 2), (2, 3), (3, 4)]
 
 
 def test_unknown_positions_are_paired_with_none():
     positions = np.array([[0.0, 0], [1, 0], [np.nan, np.nan], [2, 0]])
-    assert pairs.nearest_pairs(pairs.spatial_distances(positions), 3) == [(0, 1), (0, 3), (1, 3)]
+    assert pairs.near_pairs(positions, 3) == [(0, 1), (0, 3), (1, 3)]
 
 
 def test_of_equal_distances_the_first_is_nearest():
     assert pairs.nearest_pairs(np.zeros((4, 4)), 1) == [(0, 1), (0, 2), (0, 3)]
+    assert pairs.near_pairs(np.zeros((3, 2)), 1) == [(0, 1), (0, 2)]
+    square = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+    assert pairs.near_pairs(square, 1) == [(0, 1), (0, 2), (1, 3)]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_few_positions(count):
+    assert pairs.near_pairs(np.arange(2.0 * count).reshape(count, 2), 6) == pairs.all_pairs(count)
+
+
+def test_near_pairs_of_a_survey_are_those_of_all_distances():
+    positions = np.random.default_rng(0).normal(size=(300, 2))
+    positions[::7] = np.nan
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    assert pairs.near_pairs(positions, 6) == pairs.nearest_pairs(np.where(np.isfinite(apart), apart, np.inf), 6)
 
 
 def test_more_neighbours_than_photographs():
@@ -168,24 +184,24 @@ def rows_of(*matches):
 def test_tracks_reach_photographs_by_way_of_others():
     matches = {(0, 1): rows_of((0, 1), (1, 2), (2, 0)), (1, 2): rows_of((1, 3), (0, 1)), (2, 3): rows_of()}
     shared = pairs.shared_tracks([3, 3, 4, 5], matches)
-    assert shared.tolist() == [[0, 3, 2, 0], [3, 0, 2, 0], [2, 2, 0, 0], [0, 0, 0, 0]]
+    assert shared.todense().tolist() == [[0, 3, 2, 0], [3, 0, 2, 0], [2, 2, 0, 0], [0, 0, 0, 0]]
 
 
 def test_a_track_that_a_photograph_shows_twice_counts_once():
     matches = {(0, 1): rows_of((0, 0)), (1, 2): rows_of((0, 0)), (0, 2): rows_of((1, 0))}
-    assert pairs.shared_tracks([2, 1, 1], matches).tolist() == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
+    assert pairs.shared_tracks([2, 1, 1], matches).todense().tolist() == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
 
 
 @pytest.mark.parametrize("counts", [[], [0], [0, 3]])
 def test_no_matches_are_no_tracks(counts):
     shared = pairs.shared_tracks(counts, {})
     assert shared.shape == (len(counts), len(counts))
-    assert not shared.any()
+    assert shared.nnz == 0
 
 
 def test_pairs_of_the_second_round_share_enough_tracks():
     least = pairs.MIN_SHARED_TRACKS
-    shared = np.array([[0, 99, least, least - 1], [99, 0, 0, 0], [least, 0, 0, 0], [least - 1, 0, 0, 0]])
+    shared = csr_array([[0, 99, least, least - 1], [99, 0, 0, 0], [least, 0, 0, 0], [least - 1, 0, 0, 0]])
     assert pairs.track_pairs(shared, [(0, 1)]) == [(0, 2)]
     assert pairs.track_pairs(shared, []) == [(0, 1), (0, 2)]
     assert pairs.track_pairs(shared, [(0, 1), (0, 2)]) == []
@@ -194,7 +210,7 @@ def test_pairs_of_the_second_round_share_enough_tracks():
 def test_the_second_round_takes_the_photographs_that_share_most():
     count = pairs.TRACK_NEIGHBOURS + 2
     apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
-    found = pairs.track_pairs(1000 - apart, [])
+    found = pairs.track_pairs(csr_array(np.where(apart > 0, 1000 - apart, 0)), [])
     assert (0, count - 1) not in found
     assert set(pairs.all_pairs(count)) - set(found) == {(0, count - 1)}
 

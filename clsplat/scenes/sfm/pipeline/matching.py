@@ -58,8 +58,7 @@ def matched_pairs(
                 f"--matching spatial: none of the {len(ids):,} photos has a GPS position in its EXIF; expected "
                 "positions, or another choice such as --matching retrieval"
             )
-        apart = sfm_pairs.spatial_distances(positions)
-        pairs = sfm_pairs.nearest_pairs(apart, sfm_pairs.NEAR_NEIGHBOURS)
+        pairs = sfm_pairs.near_pairs(positions, sfm_pairs.NEAR_NEIGHBOURS)
         if not np.isfinite(positions).all():  # photographs without a position
             pairs = sfm_pairs.joined(pairs, alike(sfm_pairs.LOOP_NEIGHBOURS))
     else:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 Pair = tuple[int, int]
 
@@ -99,14 +100,24 @@ def nearest_pairs(distances: NDArray[Any], neighbours: int) -> list[Pair]:
     return _sorted((one, int(two)) for one, row in enumerate(nearest) for two in row if np.isfinite(apart[one, two]))
 
 
-def spatial_distances(positions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the distances of every two positions (N, N) from positions (N, 2); infinite where one is unknown."""
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    return np.where(np.isfinite(apart), apart, np.inf)
+def near_pairs(positions: NDArray[Any], neighbours: int) -> list[Pair]:
+    """Return the pairs of each photograph with its nearest others, at most `neighbours` of them, by their positions.
+
+    positions: (N, 2), NaN where unknown. Among equal distances the photograph with the lower index is nearer, unless
+        more than 2 `neighbours` photographs are as near.
+    """
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    places = positions[known]
+    most = min(2 * neighbours + 1, len(known))
+    distances, found = cKDTree(places).query(places, k=range(1, most + 1)) if most else (np.zeros((0, 0)),) * 2
+    order = np.lexsort((found, distances), axis=1)
+    nearest = np.take_along_axis(found, order, axis=1)
+    others = ([at for at in row if at != one][:neighbours] for one, row in enumerate(nearest.tolist()))
+    return _sorted((int(known[one]), int(known[two])) for one, row in enumerate(others) for two in row)
 
 
-def shared_tracks(counts: Sequence[int], matches: Mapping[Pair, NDArray[Any]]) -> NDArray[np.int64]:
-    """Return the number of tracks that every two photographs share (N, N), 0 for a photograph with itself.
+def shared_tracks(counts: Sequence[int], matches: Mapping[Pair, NDArray[Any]]) -> csr_array:
+    """Return the number of tracks that every two photographs share: a sparse matrix (N, N), 0 on the diagonal.
 
     A track is a set of features that matches connect, directly or by way of other photographs.
 
@@ -121,20 +132,26 @@ def shared_tracks(counts: Sequence[int], matches: Mapping[Pair, NDArray[Any]]) -
     photo = np.repeat(np.arange(len(counts)), counts)
     shown = np.unique(np.stack([photo, track]), axis=1)  # a photograph may show a track twice
     seen = csr_array((np.ones(shown.shape[1], np.int64), (shown[0], shown[1])), shape=(len(counts), tracks))
-    shared = np.asarray((seen @ seen.T).todense())
-    np.fill_diagonal(shared, 0)
+    shared = csr_array(seen @ seen.T)
+    shared.setdiag(0)
+    shared.eliminate_zeros()
     return shared
 
 
-def track_pairs(shared: NDArray[Any], matched: Iterable[Pair]) -> list[Pair]:
+def track_pairs(shared: csr_array, matched: Iterable[Pair]) -> list[Pair]:
     """Return the pairs of each photograph with those that share the most tracks, at most TRACK_NEIGHBOURS of them.
 
     shared: from `shared_tracks`. matched: pairs that are left out, as they are matched already.
     """
-    distances = np.where(shared >= MIN_SHARED_TRACKS, -shared.astype(np.float64), np.inf)
-    for one, two in matched:
-        distances[one, two] = distances[two, one] = np.inf
-    return nearest_pairs(distances, TRACK_NEIGHBOURS)
+    known = {(min(pair), max(pair)) for pair in matched}
+    pairs = set[Pair]()
+    for one in range(shared.shape[0]):
+        row = slice(shared.indptr[one], shared.indptr[one + 1])
+        counts = zip(shared.indices[row].tolist(), shared.data[row].tolist(), strict=True)
+        new = [(-count, two) for two, count in counts if count >= MIN_SHARED_TRACKS]
+        new = [(count, two) for count, two in new if (min(one, two), max(one, two)) not in known]
+        pairs.update((one, two) for _, two in sorted(new)[:TRACK_NEIGHBOURS])
+    return _sorted(pairs)
 
 
 def unconnected(count: int, verified: Iterable[Pair]) -> list[int]:
