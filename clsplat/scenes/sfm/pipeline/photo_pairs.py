@@ -126,12 +126,14 @@ def shared_tracks(counts: Sequence[int], matches: Mapping[Pair, NDArray[Any]]) -
     """
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     ends = [first[list(pair)] + rows.astype(np.int64) for pair, rows in matches.items()]
-    one, two = np.concatenate([np.zeros((0, 2), np.int64), *ends]).T
-    joins = coo_array((np.ones(len(one), np.bool_), (one, two)), shape=(first[-1], first[-1]))
+    features, places = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *ends]), return_inverse=True)
+    one, two = places.reshape(-1, 2).T
+    joins = coo_array((np.ones(len(one), np.bool_), (one, two)), shape=(len(features), len(features)))
     tracks, track = connected_components(joins, directed=False)
-    photo = np.repeat(np.arange(len(counts)), counts)
-    shown = np.unique(np.stack([photo, track]), axis=1)  # a photograph may show a track twice
-    seen = csr_array((np.ones(shown.shape[1], np.int64), (shown[0], shown[1])), shape=(len(counts), tracks))
+    photo = np.searchsorted(first, features, side="right") - 1
+    shown = np.unique(photo * tracks + track)  # a photograph may show a track twice
+    entries = (np.ones(len(shown), np.int64), (shown // max(tracks, 1), shown % max(tracks, 1)))
+    seen = csr_array(entries, shape=(len(counts), tracks))
     shared = csr_array(seen @ seen.T)
     shared.setdiag(0)
     shared.eliminate_zeros()
