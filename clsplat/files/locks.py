@@ -21,6 +21,8 @@ EMPTY_CLAIM_SECONDS = 20
 """Age in seconds at which a claim with an empty marker file counts as abandoned."""
 CLAIM_SUFFIX = ".clsplat-claim"
 """End of the name of a claim's marker file, which is .NAME.clsplat-claim beside the file NAME."""
+WRITTEN_BY = ": is being written by "
+"""Part of the error message of a command whose folder another process writes, between the folder and the process."""
 _PROCESS_TOKEN = secrets.token_hex(4)
 """Random digits that distinguish this process from others with the same process id, earlier or on another machine."""
 

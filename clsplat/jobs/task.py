@@ -133,7 +133,7 @@ def check_tasks(tasks: Sequence[JobTask]) -> None:
                 ready.append(follower)
     if done < len(tasks):
         waiting = min(name for name, count in left.items() if count)
-        raise ValueError(f"task {waiting}: waits for itself, expected tasks in an order")
+        raise ValueError(f"task {waiting}: waits for a task that waits for itself, expected tasks in an order")
 
 
 def followers_of(tasks: Sequence[JobTask]) -> dict[str, list[str]]:
