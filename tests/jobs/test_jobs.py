@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -282,8 +283,9 @@ def test_the_last_line_of_a_log(tmp_path: Path) -> None:
     assert last_line(log) == "it is \ufffd so"
 
 
-def test_claims_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine whose clock is an hour ahead does not take over what another machine has just claimed."""
+@pytest.mark.parametrize("ahead", [3600, -3600])
+def test_claims_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: int) -> None:
+    """A machine whose clock is an hour off takes over what another machine left, and not what it has just claimed."""
     from clsplat.files import atomic, locks
 
     for module in (atomic, locks):
@@ -292,11 +294,31 @@ def test_claims_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: pytest.M
     for module in (atomic, locks):
         monkeypatch.setattr(module, "machine_mark", lambda: "ffff")
     now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() + 3600)
+    monkeypatch.setattr(time, "time", lambda: now() + ahead)
     assert claim(tmp_path / "a") is None
     assert [path.name for path in tmp_path.iterdir()] == [".a.clsplat-claim"]
     os.utime(tmp_path / ".a.clsplat-claim", (now() - 700,) * 2)
     assert claim(tmp_path / "a") is not None
+
+
+def test_a_mark_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two dispatchers that write it at the same time, the second reads what the first has written."""
+    link = os.link
+
+    def other_is_first(source: Path, path: Path) -> None:
+        path.write_text("other")
+        link(source, path)
+
+    monkeypatch.setattr(os, "link", other_is_first)
+    assert mark_of(tmp_path) == mark_of(tmp_path) == "other"
+    (tmp_path / "mark").unlink()
+
+    def no_links(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "")
+
+    monkeypatch.setattr(os, "link", no_links)
+    assert len(mark_of(tmp_path)) == 32 and mark_of(tmp_path) == mark_of(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mark"]
 
 
 def test_the_attempt_speaks_json(tmp_path: Path) -> None:
