@@ -192,3 +192,16 @@ def abandoned(targets: Iterable[Path]) -> list[Path]:
                 if _is_given_up(path, _read(path)[0]):
                     result.append(path)
     return sorted(result)
+
+
+def remove_abandoned(targets: Iterable[Path]) -> None:
+    """Remove the files that `abandoned` finds, but no claim that another process takes over at the same time."""
+    for path in abandoned(targets):
+        with suppress(OSError):
+            if not path.name.endswith(CLAIM_SUFFIX):
+                path.unlink()
+                continue
+            judged = _read(path)
+            if _is_given_up(path, judged[0]):
+                target = path.with_name(path.name.removeprefix(".").removesuffix(CLAIM_SUFFIX))
+                _remove_judged(path, judged, temporary_name(target))

@@ -59,12 +59,14 @@ def test_what_a_killed_process_has_claimed_is_taken_over(tmp_path: Path, monkeyp
     assert claim(first.path) is not None
 
 
+@pytest.mark.parametrize("removes", [False, True])
 @pytest.mark.parametrize("links", [True, False])
 def test_a_claim_that_another_process_takes_over_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool, removes: bool
 ) -> None:
     """Between this process's look at an abandoned marker and its removal: the other process keeps the claim."""
-    target, marker = tmp_path / "a.exr", tmp_path / ".a.exr.clsplat-claim"
+    (task,) = tasks_in(tmp_path, 1)
+    target, marker = task.path, tmp_path / f".{task.path.name}.clsplat-claim"
     subprocess.run([sys.executable, "-c", ENDED, str(target)], check=True)
     judge, theirs = locks._is_given_up, f"ffff{1:08x}{'0' * 8}".encode()
 
@@ -81,7 +83,10 @@ def test_a_claim_that_another_process_takes_over_first(
         patches.setattr(locks, "_is_given_up", other_is_first)
         if not links:
             patches.setattr(os, "link", no_links)
-        assert claim(target) is None
+        if removes:
+            remove_temporaries([task])
+        else:
+            assert claim(target) is None
     assert marker.read_bytes() == theirs and [*tmp_path.iterdir()] == [marker]
     assert claim(target) is None
 
