@@ -34,11 +34,22 @@ an indexer closes a new file within one second."""
 TEMPORARY_NAME = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
 """Pattern of the names that `temporary_name` makes. Its groups: the target's name, and the token for `is_abandoned`."""
 
+_BOOT_ID_FILE, _PID_NAMESPACE_FILE = Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/pid")
+
 
 @cache
 def machine_mark() -> str:
-    """Four hexadecimal digits that identify this machine: the beginning of a digest of its host name."""
-    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:4]
+    """Four hexadecimal digits that identify this machine, or this container, by which a process id is unique.
+
+    They are the beginning of a digest of the host name and, on Linux, of the boot and of the process id namespace.
+    Containers may have the same host name, and machines may be copies of one image.
+    """
+    parts = [socket.gethostname()]
+    with suppress(OSError):
+        parts.append(_BOOT_ID_FILE.read_text(encoding="ascii").strip())
+    with suppress(OSError):
+        parts.append(str(_PID_NAMESPACE_FILE.stat().st_ino))
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:4]
 
 
 def temporary_name(target: Path) -> Path:
@@ -69,15 +80,13 @@ def is_abandoned(path: Path, token: str) -> bool:
 def is_older(path: Path, seconds: float) -> bool:
     """True if a file was last changed more than `seconds` ago, by the clock of its file system. Raises OSError.
 
-    On a shared folder this machine's clock may be minutes ahead. Another machine's new file would then count as old, so
-    a new file is made in the folder to compare with. If the folder cannot be written, this machine's clock counts.
+    The clock of a shared folder may differ from this machine's by hours, in both directions. So a new file is made in
+    the folder to compare with. If the folder cannot be written, this machine's clock counts.
     """
-    changed = path.stat().st_mtime
-    if time.time() - changed <= seconds:
-        return False
+    changed, now = path.stat().st_mtime, time.time()
     with suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, prefix=".clsplat-clock-") as probe:
-        return os.fstat(probe.fileno()).st_mtime - changed > seconds
-    return True
+        now = os.fstat(probe.fileno()).st_mtime
+    return now - changed > seconds
 
 
 def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:

@@ -116,7 +116,7 @@ def _end_at(ended: threading.Event, process: subprocess.Popen[bytes]) -> None:
 
 
 def end_command(process: subprocess.Popen[bytes]) -> None:
-    """Ask a command to end, as by SIGTERM, and kill it with its processes after END_SECONDS."""
+    """Ask a command to end (SIGTERM; Ctrl-Break on Windows). Kill it and its processes after END_SECONDS."""
     with suppress(OSError):
         if sys.platform == "win32":
             process.send_signal(signal.CTRL_BREAK_EVENT)

@@ -12,7 +12,7 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.files.locks import claim, give_back
+from clsplat.files.locks import claim, give_back, is_own_marker
 
 CLAIM_HEARTBEAT_SECONDS = 60.0
 """Seconds between updates of a claim file's modification time, so that it stays younger than ABANDONED_FILE_SECONDS."""
@@ -56,4 +56,5 @@ class HeldClaims:
             with self._changing:
                 for marker in self._markers.values():
                     with suppress(OSError):
-                        os.utime(marker)  # unlike Path.touch, does not create a missing file
+                        if is_own_marker(marker):
+                            os.utime(marker)  # unlike Path.touch, does not create a missing file

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import inspect
 import queue
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,9 +26,15 @@ WORKERS_SECONDS = 1.0
 """Seconds between looks at the scheduler's list of workers."""
 STOP_SECONDS = 90.0
 """Seconds that the workers have to end their attempts. Attempts kill their commands before this time is over."""
+OUTCOME_SECONDS = 30.0
+"""Seconds that a worker has to send the outcome of an ended attempt."""
 
 _attempts_here: dict[str, AttemptProcess] = {}
 """In a worker: its running attempts, by the key of their Dask task."""
+_ended_here: set[str] = set()
+"""In a worker: keys of the attempts that were ended, also before they began."""
+_changing_here = threading.Lock()
+"""In a worker: held while an attempt begins, or is ended."""
 
 
 def run_on_worker(key: str, document: dict[str, Any]) -> dict[str, Any]:
@@ -39,7 +47,10 @@ def run_on_worker(key: str, document: dict[str, Any]) -> dict[str, Any]:
         attempt = Attempt(**document)
     except TypeError:  # a field that this version does not have
         return asdict(Outcome(name, "unfit", reason=f"has another version of clsplat than {document.get('version')}"))
-    process = _attempts_here[key] = AttemptProcess(attempt)
+    with _changing_here:
+        if key in _ended_here:
+            return asdict(Outcome(name, "lost", reason="ended it before it began"))
+        process = _attempts_here[key] = AttemptProcess(attempt)
     try:
         return asdict(process.wait())
     finally:
@@ -60,11 +71,17 @@ def by_value() -> Callable[[str, dict[str, Any]], dict[str, Any]]:
     return call
 
 
-def end_on_worker(keys: list[str], *, kill: bool = False) -> None:
-    """In a worker: ask attempts to end, without waiting, or kill them. keys: keys of their Dask tasks."""
-    for key in keys:
-        if (process := _attempts_here.get(key)) is not None:
-            (process.kill if kill else process.ask_to_end)()
+def end_on_worker(keys: list[str], *, kill: bool = False) -> list[str]:
+    """In a worker: ask attempts to end, without waiting, or kill them. Attempts that have not begun never begin.
+
+    keys: keys of the attempts' Dask tasks. Returns the keys of the attempts that still run here.
+    """
+    with _changing_here:
+        _ended_here.update(keys)
+        running = {key: process for key in keys if (process := _attempts_here.get(key)) is not None}
+    for process in running.values():
+        (process.kill if kill else process.ask_to_end)()
+    return list(running)
 
 
 @dataclass(frozen=True)
@@ -88,7 +105,11 @@ class DaskEngine:
         self._sent: dict[str, _Sent] = {}
         self._ended: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._left_out: set[str] = set()
-        self._workers: dict[str, bool] = {}
+        self._workers: dict[str, bool] = {}  # those that get attempts, and whether they declare a GPU
+        self._present: set[str] = set()  # all workers of the cluster
+        takes = inspect.signature(client.scheduler_info).parameters
+        # from 2025.4 on, distributed returns only 5 workers by default
+        self._all_workers = {"n_workers": -1} if "n_workers" in takes else {}
         self._looked_at = float("-inf")
 
     def free(self) -> int:
@@ -123,7 +144,7 @@ class DaskEngine:
         outcomes = [self._outcome(self._sent.pop(key)) for key in keys if key in self._sent]
         self._look()
         for key, sent in list(self._sent.items()):
-            if sent.worker not in self._workers and not sent.future.done():
+            if sent.worker not in self._present and not sent.future.done():
                 del self._sent[key]
                 with self._reaching():
                     sent.future.cancel()
@@ -149,7 +170,11 @@ class DaskEngine:
         workers = sorted({sent.worker for sent in self._sent.values()})
         keys, until = list(self._sent), time.monotonic() + seconds
         with suppress(OSError, RuntimeError, TimeoutError):
-            self._client.run(end_on_worker, keys, kill=kill, workers=workers, on_error="ignore")
+            answers = self._client.run(end_on_worker, keys, kill=kill, workers=workers, on_error="ignore")
+            for key, sent in list(self._sent.items()):
+                if key not in answers.get(sent.worker, [key]):  # has not begun, or has ended
+                    del self._sent[key]
+                    sent.future.cancel()
         with suppress(ClsplatError):
             while self._sent and time.monotonic() < until:
                 self.wait(MAX_SIGNAL_WAIT_SECONDS)
@@ -160,12 +185,13 @@ class DaskEngine:
         return [worker for worker in self._workers if worker not in busy and worker not in self._left_out]
 
     def _look(self) -> None:
-        """Read the list of workers, if the last look is WORKERS_SECONDS ago. Raises ClsplatError."""
+        """Read the list of workers, if the last look is at least WORKERS_SECONDS ago. Raises ClsplatError."""
         now = time.monotonic()
         if now - self._looked_at < WORKERS_SECONDS:
             return
         with self._reaching():
-            infos = self._client.scheduler_info()["workers"]
+            infos = self._client.scheduler_info(**self._all_workers)["workers"]
+        self._present = set(infos)
         gpus = {address: info.get("resources", {}).get(GPU_RESOURCE, 0) >= 1 for address, info in infos.items()}
         self._workers = {address: gpu for address, gpu in gpus.items() if gpu or not any(gpus.values())}
         self._looked_at = now
@@ -180,12 +206,15 @@ class DaskEngine:
         from distributed import CancelledError
 
         try:
-            return replace(Outcome(**sent.future.result()), worker=sent.worker)
+            return replace(Outcome(**sent.future.result(timeout=OUTCOME_SECONDS)), worker=sent.worker)
         except (ImportError, AttributeError, TypeError) as error:
             reason = f"has no clsplat of this version: {error}"
             return Outcome(sent.name, "unfit", reason=reason, worker=sent.worker)
         except CancelledError:
             raise self._lost() from None
+        except TimeoutError:
+            reason = f"has not sent the outcome within {OUTCOME_SECONDS:.0f} s"
+            return Outcome(sent.name, "lost", reason=reason, worker=sent.worker)
         except Exception as error:  # noqa: BLE001  # an error of Dask's or the worker's: the attempt is repeated
             reason = " ".join(str(error).split()) or type(error).__name__
             return Outcome(sent.name, "lost", reason=reason, worker=sent.worker)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from clsplat.errors import ClsplatError, examples, warn
 from clsplat.files.atomic import ABANDONED_FILE_SECONDS
-from clsplat.files.locks import is_claimed
+from clsplat.files.locks import WRITTEN_BY, is_claimed
 from clsplat.jobs.task import (
     ATTEMPT_PREFIX,
     Attempt,
@@ -93,14 +93,14 @@ def run_tasks(
 class _Dispatcher:
     """Tasks by state, and their progress as far as it is known.
 
-    done: number of tasks that are done. failed: why each failed task has failed, by name.
+    done: number of tasks that are done. failed: names of the failed tasks.
     """
 
     def __init__(self, tasks: Sequence[JobTask], engine: Engine, folder: Path, needs: tuple[str, ...]) -> None:
         self.tasks = {task.name: task for task in tasks}
         self.engine, self.folder, self.needs, self.mark = engine, folder, needs, mark_of(folder)
         self.done = 0
-        self.failed: dict[str, str] = {}
+        self.failed: list[str] = []
         self._followers = followers_of(tasks)
         self._missing = {task.name: len(set(task.after)) for task in tasks}
         self._ready = deque(task.name for task in tasks if not task.after)
@@ -122,6 +122,8 @@ class _Dispatcher:
                 self._ready.append(heapq.heappop(self._later)[1])
             while self._ready and self.engine.free() > 0:
                 self._begin(self._ready.popleft())
+            if not self._running:  # no worker is left, but other processes may have done or claimed the tasks
+                self._sort_out()
             if not (self._running or self._ready or self._later):
                 on_progress(self._progress())
                 return
@@ -151,16 +153,30 @@ class _Dispatcher:
 
     def _begin(self, name: str) -> None:
         """Start an attempt at a task, unless it is done, or another process has claimed it."""
-        task = self.tasks[name]
-        if task.is_done():
-            self._finish(name)
-        elif is_claimed(self.folder / name):
-            self._wait_for_claim(name)
-        else:
-            self._claimed.pop(name, None)
+        if self._is_left(name):
             self._running.add(name)
             self._before[name] = self._steps[name]
-            self.engine.start(Attempt(name, task.command, str(self.folder), self.needs, self.mark))
+            command = self.tasks[name].command
+            self.engine.start(Attempt(name, command, str(self.folder), self.needs, self.mark))
+
+    def _sort_out(self) -> None:
+        """Take the tasks that are done, or that other processes have claimed, out of the ready ones."""
+        left: deque[str] = deque()
+        while self._ready:
+            if self._is_left(name := self._ready.popleft()):
+                self._claimed.pop(name, None)
+                left.append(name)
+        self._ready = left
+
+    def _is_left(self, name: str) -> bool:
+        """True if an attempt at a task has to be started. A task that is done is counted, a claimed one waited for."""
+        if self.tasks[name].is_done():
+            self._finish(name)
+            return False
+        if is_claimed(self.folder / name):
+            self._wait_for_claim(name)
+            return False
+        return True
 
     def _finish(self, name: str) -> None:
         """Count a task as done. Tasks that waited for this task alone become ready."""
@@ -177,9 +193,12 @@ class _Dispatcher:
         name = outcome.name
         self._running.discard(name)
         task = self.tasks[name]
+        claimed = outcome.kind == "claimed" or self._is_written(outcome)
+        if not claimed:
+            self._claimed.pop(name, None)
         if task.is_done():
             self._finish(name)
-        elif outcome.kind == "claimed":
+        elif claimed:
             self._wait_for_claim(name)
         elif outcome.kind == "unfit":
             self._leave_out(outcome)
@@ -190,6 +209,11 @@ class _Dispatcher:
                 self._fail(outcome)
             else:
                 heapq.heappush(self._later, (time.monotonic() + RETRY_SECONDS, name))
+
+    def _is_written(self, outcome: Outcome) -> bool:
+        """True if a command has ended because another process, without a claim, writes the task's result."""
+        refused = outcome.kind == "ended" and outcome.status == 2
+        return refused and WRITTEN_BY in last_line(log_path(self.folder, outcome.name))
 
     def _leave_out(self, outcome: Outcome) -> None:
         """Use an unfit worker no more, and begin its task next. Raises ClsplatError if no worker is left."""
@@ -210,7 +234,7 @@ class _Dispatcher:
             why = f"the command ended with status {outcome.status}"
         line = last_line(log)
         end = f"; {log} ends with: {line}" if line and not line.startswith(ATTEMPT_PREFIX) else f"; see {log}"
-        self.failed[outcome.name] = why
+        self.failed.append(outcome.name)
         warn(f"task {outcome.name} failed {MAX_TRIES} times without progress; {why}{end}")
 
     def _wait_for_claim(self, name: str) -> None:
@@ -222,7 +246,7 @@ class _Dispatcher:
             minutes = ABANDONED_FILE_SECONDS / 60
             warn(
                 f"task {name} is claimed by another process; waiting until that process has done it or has ended (on "
-                f"another machine, until its claim is {minutes:.0f} minutes old)"
+                f"another machine or in another container, until its claim is {minutes:.0f} minutes old)"
             )
         heapq.heappush(self._later, (now + CLAIM_CHECK_SECONDS, name))
 

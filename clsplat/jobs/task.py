@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import secrets
 from collections.abc import Callable, Sequence
@@ -11,8 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from clsplat.files.atomic import atomic_write
-from clsplat.files.locks import briefly_locked
+from clsplat.files.atomic import remove, replace, temporary_name
 from clsplat.version import package_version
 
 MARK_FILE_NAME = "mark"
@@ -133,7 +133,7 @@ def check_tasks(tasks: Sequence[JobTask]) -> None:
                 ready.append(follower)
     if done < len(tasks):
         waiting = min(name for name, count in left.items() if count)
-        raise ValueError(f"task {waiting}: waits for itself, expected tasks in an order")
+        raise ValueError(f"task {waiting}: waits for a task that waits for itself, expected tasks in an order")
 
 
 def followers_of(tasks: Sequence[JobTask]) -> dict[str, list[str]]:
@@ -149,10 +149,24 @@ def mark_of(folder: Path) -> str:
     """The content of the folder's file MARK_FILE_NAME, which is written first if it is missing. Raises OSError."""
     path = folder / MARK_FILE_NAME
     if not path.exists():
-        with briefly_locked(path):  # another dispatcher may write it at the same time
-            if not path.exists():
-                atomic_write(path, secrets.token_hex(16).encode())
+        temporary = temporary_name(path)
+        try:
+            temporary.write_bytes(secrets.token_hex(16).encode())
+            _link_if_missing(temporary, path)
+        finally:
+            remove(temporary)
     return path.read_text(encoding="ascii", errors="replace")
+
+
+def _link_if_missing(source: Path, path: Path) -> None:
+    """Make `path` a hard link to `source`, unless another dispatcher has made a file there."""
+    try:
+        os.link(source, path)
+    except FileExistsError:
+        pass
+    except OSError:  # a file system without hard links
+        if not path.exists():
+            replace(source, path)
 
 
 def log_path(folder: str | Path, name: str) -> Path:

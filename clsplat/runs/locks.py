@@ -19,6 +19,7 @@ from typing import IO
 
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import parse_json
+from clsplat.files.locks import WRITTEN_BY
 
 LOCK_FILE_NAME = ".clsplat-lock"
 """Name of the lock file in a run's folder. Its content names the process that writes there."""
@@ -72,7 +73,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
                 who = _who(file)
                 file.close()
                 raise InputError(
-                    f"{folder}: is being written by {who}; wait until that process has ended, or choose another folder"
+                    f"{folder}{WRITTEN_BY}{who}; wait until that process has ended, or choose another folder"
                 ) from None
             if error.errno not in _NO_LOCKING_ERRNOS:
                 file.close()

@@ -7,14 +7,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.errors import InputError, examples, reason_of, warn
 from clsplat.files.documents import is_file
-from clsplat.files.locks import abandoned
+from clsplat.files.locks import remove_abandoned
 from clsplat.images.frame_files import (
     MODEL_DIGEST_ATTRIBUTE,
     SETTINGS_DIGEST_ATTRIBUTE,
@@ -60,9 +59,7 @@ def make_folders(tasks: Sequence[Task]) -> None:
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:
     """Remove temporary files of these frames that killed jobs have left, but not files that are still being written."""
-    for path in abandoned(task.path for task in tasks):
-        with suppress(OSError):
-            path.unlink()
+    remove_abandoned(task.path for task in tasks)
 
 
 def _identity(task: Task, options: RenderOptions) -> dict[str, str | int | float]:

@@ -18,14 +18,15 @@ CLSPLAT=${CLSPLAT:-clsplat}
 mkdir -p "$city/jobs"
 
 # submit NAME DEPENDENCY [OPTIONS]: submits the job script on standard input, and prints the number of the job. If the
-# job that it depends on fails, it is cancelled. A job that is about to be ended has two minutes to write a checkpoint.
+# job that it depends on fails, it is cancelled. Slurm sends SIGTERM (B: to the job script, which is the command) two
+# minutes before a job's time is over, so that the command can write a checkpoint.
 submit() {
     name=$1 after=$2
     shift 2
     case "$*" in *--array*) number=%A_%a ;; *) number=%j ;; esac
     # SBATCH is split into words
     # shellcheck disable=SC2086
-    sbatch --parsable --job-name "clsplat-$name" --output "$city/jobs/slurm-$name-$number.log" --signal=TERM@120 \
+    sbatch --parsable --job-name "clsplat-$name" --output "$city/jobs/slurm-$name-$number.log" --signal=B:TERM@120 \
         --kill-on-invalid-dep=yes ${after:+--dependency=afterok:$after} ${SBATCH:-} "$@"
 }
 

@@ -115,6 +115,44 @@ def test_what_kubernetes_runs() -> None:
     assert "--blocks, 2x2" in KUBERNETES.read_text() and jobs[1]["spec"]["completions"] == 4
 
 
+def test_a_block_of_kubernetes_is_repeated() -> None:
+    """Kubernetes refuses a limit for each index, and a policy for failed pods, with another restart policy."""
+    jobs = list(yaml.safe_load_all(KUBERNETES.read_text()))
+    for spec in (job["spec"] for job in jobs):
+        if "backoffLimitPerIndex" in spec or "podFailurePolicy" in spec:
+            assert spec["template"]["spec"]["restartPolicy"] == "Never"
+    assert jobs[1]["spec"]["backoffLimitPerIndex"] == 3
+    rule = {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]}
+    assert jobs[1]["spec"]["podFailurePolicy"] == {"rules": [rule]}
+
+
+@posix
+@pytest.mark.parametrize(
+    ("last", "status", "steps"), [("Complete", 0, ["plan", "blocks", "merge", "finish"]), ("Failed", 1, ["plan"])]
+)
+def test_how_kubernetes_is_waited_for(tmp_path: Path, last: str, status: int, steps: list[str]) -> None:
+    """The loop of the template's head waits until a Job is complete, and ends when it has failed."""
+    lines = [line.removeprefix("#     ") for line in KUBERNETES.read_text().splitlines() if line.startswith("#     ")]
+    calls = tmp_path / "calls"
+    stubs = f"""
+        sleep() {{ touch {tmp_path}/slept; }}
+        kubectl() {{
+            if [ "$1" = apply ]; then echo "$5" >> {calls}; rm -f {tmp_path}/slept; return; fi
+            if [ -e {tmp_path}/slept ]; then echo "FailureTarget {last}"; fi
+        }}
+    """
+    line = ["sh", "-c", stubs + "\n".join(lines)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=30)
+    assert done.returncode == status
+    assert calls.read_text().split() == [f"step={step}" for step in steps]
+    assert done.stderr == ("" if status == 0 else "clsplat-plan: not complete, state: FailureTarget Failed\n")
+
+
+def test_slurm_signals_the_command() -> None:
+    """Without "B:" the signal goes to job steps, of which these jobs have none."""
+    assert "--signal=B:TERM@120" in SLURM.read_text()
+
+
 def test_the_number_of_a_block(
     planned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,7 +131,7 @@ def test_workers_that_are_left_out(
     assert told[0].startswith("worker tcp://127.0.0.1:")
 
 
-def test_a_worker_without_this_room(tmp_path: Path, cluster: DaskProcesses, told: list[str]) -> None:
+def test_a_worker_without_this_package(tmp_path: Path, cluster: DaskProcesses, told: list[str]) -> None:
     """As of an earlier version: it is left out, with what it says."""
     earlier = tmp_path / "earlier" / "clsplat"
     earlier.mkdir(parents=True)

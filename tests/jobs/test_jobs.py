@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -19,7 +20,7 @@ from counting import counted, counting_task
 from systems import alive, posix
 
 from clsplat.errors import ClsplatError
-from clsplat.files.locks import claim
+from clsplat.files.locks import WRITTEN_BY, claim
 from clsplat.jobs import attempt, dispatcher
 from clsplat.jobs.dispatcher import JobProgress, run_tasks
 from clsplat.jobs.local_engine import LocalEngine
@@ -154,6 +155,56 @@ def test_a_task_of_another_process_is_waited_for(tmp_path: Path, monkeypatch: py
     assert counted(tmp_path, "a") == 1
 
 
+class NoWorkers(LocalEngine):
+    """Engine of a cluster without workers."""
+
+    def free(self) -> int:
+        return 0
+
+
+def test_tasks_that_are_done_need_no_worker(tmp_path: Path) -> None:
+    """Those that were done before, also one after another, and those that other processes do meanwhile."""
+
+    def task(name: str, *after: str) -> JobTask:
+        return JobTask(name, ("x",), (tmp_path / f"{name}.done").exists, after)
+
+    tasks = [task("a"), task("b", "a"), task("c", "b")]
+    for name in "ab":
+        (tmp_path / f"{name}.done").touch()
+    seen: list[JobProgress] = []
+
+    def do_the_last(progress: JobProgress) -> None:
+        seen.append(progress)
+        (tmp_path / "c.done").touch()
+
+    run_tasks(tasks, NoWorkers(), tmp_path / "jobs", do_the_last)
+    assert seen[0] == JobProgress(2, 3, 2, 3) and seen[-1] == JobProgress(3, 3, 3, 3)
+    assert not list((tmp_path / "jobs").glob("*.log"))
+
+
+def test_a_result_that_a_process_without_a_claim_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as a command that a user or Slurm has started: it is waited for, and the attempts do not count."""
+    told: list[str] = []
+    monkeypatch.setattr(dispatcher, "warn", told.append)
+    monkeypatch.setattr(dispatcher, "MAX_TRIES", 2)
+    monkeypatch.setattr(dispatcher, "CLAIMED_WARNING_SECONDS", 0.01)  # less than an attempt takes
+    message = (
+        f"clsplat: error: /city/blocks/0_0{WRITTEN_BY}clsplat blocks (process 7); wait until that process has ended"
+    )
+    code = "import sys; from pathlib import Path; begun = Path(sys.argv[1]); done = Path(sys.argv[2])\n"
+    code += "with begun.open('a') as file: file.write('x')\n"
+    code += "if begun.stat().st_size < 4: sys.exit(print(sys.argv[3]) or 2)\n"
+    code += "done.touch()"
+    begun, done = tmp_path / "begun", tmp_path / "done"
+    task = JobTask("a", (sys.executable, "-c", code, str(begun), str(done), message), done.exists)
+    run_tasks([task], LocalEngine(1), tmp_path / "jobs")
+    assert begun.read_text() == "xxxx"
+    assert len(told) == 1 and told[0].startswith("task a is claimed by another process; waiting until that process")
+    other = JobTask("b", (sys.executable, "-c", f"import sys; print({message!r}); sys.exit(1)"), lambda: False)
+    refuses("1 of 1 tasks failed", run_tasks, [other], LocalEngine(1), tmp_path / "jobs", error=ClsplatError)
+    assert told[1].startswith("task b failed 2 times without progress; the command ended with status 1")
+
+
 @posix
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL]
@@ -213,7 +264,11 @@ def test_wrong_tasks_are_refused(tmp_path: Path) -> None:
         ([task("a/b")], "expected a name of letters"),
         ([task("mark")], "expected a name of letters"),
         ([task("a", "b")], "is after b, which is not a task"),
-        ([task("a", "b"), task("b", "a")], "waits for itself"),
+        (
+            [task("a", "b"), task("b", "a")],
+            "task a: waits for a task that waits for itself, expected tasks in an order",
+        ),
+        ([task("a", "b"), task("b", "c"), task("c", "b")], "task a: waits for a task that waits for itself"),
     ):
         refuses(message, check_tasks, tasks, error=ValueError)
     refuses("workers 0", LocalEngine, 0, error=ValueError)
@@ -228,8 +283,9 @@ def test_the_last_line_of_a_log(tmp_path: Path) -> None:
     assert last_line(log) == "it is \ufffd so"
 
 
-def test_claims_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine whose clock is an hour ahead does not take over what another machine has just claimed."""
+@pytest.mark.parametrize("ahead", [3600, -3600])
+def test_claims_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: int) -> None:
+    """A machine whose clock is an hour off takes over what another machine left, and not what it has just claimed."""
     from clsplat.files import atomic, locks
 
     for module in (atomic, locks):
@@ -238,11 +294,31 @@ def test_claims_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: pytest.M
     for module in (atomic, locks):
         monkeypatch.setattr(module, "machine_mark", lambda: "ffff")
     now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() + 3600)
+    monkeypatch.setattr(time, "time", lambda: now() + ahead)
     assert claim(tmp_path / "a") is None
     assert [path.name for path in tmp_path.iterdir()] == [".a.clsplat-claim"]
     os.utime(tmp_path / ".a.clsplat-claim", (now() - 700,) * 2)
     assert claim(tmp_path / "a") is not None
+
+
+def test_a_mark_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two dispatchers that write it at the same time, the second reads what the first has written."""
+    link = os.link
+
+    def other_is_first(source: Path, path: Path) -> None:
+        path.write_text("other")
+        link(source, path)
+
+    monkeypatch.setattr(os, "link", other_is_first)
+    assert mark_of(tmp_path) == mark_of(tmp_path) == "other"
+    (tmp_path / "mark").unlink()
+
+    def no_links(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "")
+
+    monkeypatch.setattr(os, "link", no_links)
+    assert len(mark_of(tmp_path)) == 32 and mark_of(tmp_path) == mark_of(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mark"]
 
 
 def test_the_attempt_speaks_json(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from calls import refuses
@@ -56,6 +57,72 @@ def test_what_a_killed_process_has_claimed_is_taken_over(tmp_path: Path, monkeyp
         monkeypatch.setattr(module, "machine_mark", lambda: "0000")
         monkeypatch.setattr(module, "ABANDONED_FILE_SECONDS", -1.0)
     assert claim(first.path) is not None
+
+
+@pytest.mark.parametrize("removes", [False, True])
+@pytest.mark.parametrize("links", [True, False])
+def test_a_claim_that_another_process_takes_over_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool, removes: bool
+) -> None:
+    """Between this process's look at an abandoned marker and its removal: the other process keeps the claim."""
+    (task,) = tasks_in(tmp_path, 1)
+    target, marker = task.path, tmp_path / f".{task.path.name}.clsplat-claim"
+    subprocess.run([sys.executable, "-c", ENDED, str(target)], check=True)
+    judge, theirs = locks._is_given_up, f"ffff{1:08x}{'0' * 8}".encode()
+
+    def other_is_first(path: Path, content: bytes) -> bool:
+        given_up = judge(path, content)
+        marker.unlink()
+        marker.write_bytes(theirs)
+        return given_up
+
+    def no_links(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "")
+
+    with monkeypatch.context() as patches:
+        patches.setattr(locks, "_is_given_up", other_is_first)
+        if not links:
+            patches.setattr(os, "link", no_links)
+        if removes:
+            remove_temporaries([task])
+        else:
+            assert claim(target) is None
+    assert marker.read_bytes() == theirs and [*tmp_path.iterdir()] == [marker]
+    assert claim(target) is None
+
+
+def test_a_claim_that_was_lost_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that was stopped for long neither touches nor removes the marker of its successor."""
+    monkeypatch.setattr(claims, "CLAIM_HEARTBEAT_SECONDS", 0.01)
+    held, target = claims.HeldClaims(), tmp_path / "a"
+    assert held.take(target)
+    (marker,) = tmp_path.iterdir()
+    marker.write_bytes(b"ffff0000000100000000")
+    os.utime(marker, (1000, 1000))
+    time.sleep(0.1)  # ten updates
+    assert marker.stat().st_mtime == 1000
+    held.release(target)
+    assert marker.exists()
+    held.close()
+
+
+def test_containers_with_one_host_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their process ids are told apart by their namespaces, and those of machines by the boot."""
+    boot, inodes = tmp_path / "boot", iter([OSError(), 1, 1, 2])
+
+    def namespace() -> os.stat_result:
+        if isinstance(inode := next(inodes), OSError):
+            raise inode
+        return os.stat_result((0, inode, *[0] * 8))
+
+    monkeypatch.setattr("socket.gethostname", lambda: "node")
+    monkeypatch.setattr(atomic, "_BOOT_ID_FILE", boot)
+    monkeypatch.setattr(atomic, "_PID_NAMESPACE_FILE", SimpleNamespace(stat=namespace))
+    marks = [atomic.machine_mark.__wrapped__()]
+    for text in ("boot", "another boot", "another boot"):
+        boot.write_text(text)
+        marks.append(atomic.machine_mark.__wrapped__())
+    assert len({*marks}) == 4 and all(len(mark) == 4 for mark in marks)
 
 
 def test_a_claim_that_nobody_touches_holds_nobody_up(tmp_path: Path) -> None:
