@@ -24,7 +24,7 @@ def scene_of_block(scene: Scene, block: Block, coarse: Run) -> Scene:
     there = {view.name: view for view in whole.train_views}
     return replace(
         whole,
-        name=f"{scene.name}, block {block.name.replace('_', ',')}",
+        name=f"{scene.name}, block {block.shown}",
         views=[there[name] for name in sorted(block.photographs)],
         whole_extent=scene.extent,
     )

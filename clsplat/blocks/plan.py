@@ -67,6 +67,11 @@ class Block:
     iterations: int
     gaussians: int
 
+    @property
+    def shown(self) -> str:
+        """The name as commands and messages write it, such as "0,1"."""
+        return shown_name(self.name)
+
 
 @dataclass(frozen=True)
 class Partition:
@@ -128,7 +133,7 @@ class BlockPlan:
         for block in self.blocks:
             if block.name == name.replace(",", "_").replace(" ", ""):
                 return block
-        names = examples([block.name.replace("_", ",") for block in self.blocks], 8)
+        names = examples([block.shown for block in self.blocks], 8)
         raise InputError(f"--block {name}: the plan has no such block, expected one of {names}")
 
     def document(self) -> dict[str, Any]:
@@ -166,6 +171,11 @@ class BlockPlan:
                 for block in self.blocks
             ],
         }
+
+
+def shown_name(name: str) -> str:
+    """Return the name of a block, such as "0_1", as commands and messages write it: "0,1"."""
+    return name.replace("_", ",")
 
 
 def write_plan(city: Path, plan: BlockPlan) -> None:

@@ -141,6 +141,19 @@ def test_wrong_calls_are_refused(whole: Path, small_scene: Path, tmp_path: Path,
     assert not (tmp_path / "run").exists()
 
 
+def test_finished_trainings_open_no_device(whole: Path, capsys: Capture) -> None:
+    def forbidden(*_: object, **__: object) -> Any:
+        raise AssertionError("no device is opened")
+
+    services, city = Services(open_device=forbidden, open_devices=forbidden), str(whole)
+    assert main(["blocks", "train", city, "--block", "1,0"], services) == 0
+    assert main(["blocks", "train", city, "--block", "01"], services) == 0
+    assert main(["blocks", "finish", city], services) == 0
+    capsys.readouterr()
+    assert main(["blocks", "train", city, "--block", "9" * 5000], services) == 0
+    assert "the plan has 2 blocks, so there is nothing to do" in capsys.readouterr().err
+
+
 def test_a_damaged_plan_is_one_line(whole: Path, tmp_path: Path, capsys: Capture) -> None:
     city = planned(whole, tmp_path / "city")
     (city / "plan.json").write_text("{")

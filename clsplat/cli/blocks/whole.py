@@ -124,7 +124,7 @@ def _one_after_another(verb: TrainVerb, services: Services, plan: BlockPlan) -> 
     load, count = _loading_once(loader(services)), verb.device.count
     train = trainer(services, verb.device)
     for index, block in enumerate(plan.blocks, 1):
-        name = block.name.replace("_", ",")
+        name = block.shown
         with _advice(verb, f"in block {name}, {index} of {len(plan.blocks)}"):
             print(f"block {name}, {index} of {len(plan.blocks)}", file=sys.stderr)
             if not train_block(verb.output, name, load, train, count):
