@@ -64,7 +64,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         coarse = Run.open(city / COARSE_FOLDER)
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene, photographs=block.photographs)
-        part, region = scene_of_block(scene, block, coarse), region_of_cell(plan, block.widened)
+        part, region = scene_of_block(scene, plan, block, coarse), region_of_cell(plan, block.widened)
         model = first_model_of_block(coarse.model_path, region, part, plan.settings)
         surroundings = len(model) - block.gaussians
         config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)
@@ -99,7 +99,7 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
         run = Run.create(city, config, scene=plan.scene, resume=is_run(city), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "finish", str(city)])
         start = Start(Gaussians.load(city / MERGED_FILE), None, _with_appearance(coarse), trains_appearance=True)
-        train(scene_of_finish(scene, coarse), run, start)
+        train(scene_of_finish(scene, plan, coarse), run, start)
         _copy_refined(coarse, run)
         keep_done(city, plan.digest, merged)
     return True

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from calls import refusal
 from compare import assert_same_bits
-from small_city import BLOCK_STEPS, FINISH_STEPS, in_cell, load, trains_on
+from small_city import BLOCK_STEPS, FINISH_STEPS, WHOLE, in_cell, load, trains_on
 
 from clsplat.blocks.block_training import finish, is_finished, train_block
 from clsplat.blocks.merging import is_merged, merge
@@ -21,6 +21,9 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.runs.scene_record import read
+from clsplat.scenes.loading import load_scene_of
+from clsplat.scenes.scene import Scene
+from clsplat.training.start import Start
 
 BLOCKS = ("0,0", "1,0")
 
@@ -207,7 +210,14 @@ def test_a_missing_photograph_is_named(
     plan["scene"] = str(scene)
     (city / "plan.json").write_text(json.dumps(plan))
     (scene / "images" / "09.png").unlink()
-    assert train_block(city, "0,0", load(), trains_on(default_device)), "the block does not have this photograph"
+    units = list[float]()
+
+    def train(scene: Scene, run: Run, start: Start) -> object:
+        units.append(scene.extent)
+        return trains_on(default_device)(scene, run, start)
+
+    assert train_block(city, "0,0", load(), train), "the block does not have this photograph"
+    assert units == [load_scene_of(WHOLE, small_scene).extent], "that of the whole, with the missing camera"
     assert "1 view missing now (09.png)" in refusal(lambda: train_block(city, "1,0", load(), trains_on(default_device)))
 
 

@@ -17,7 +17,7 @@ from quality.trainings import Rows, call, trained, words_of
 from clsplat.arrays import Float32, Float64
 from clsplat.blocks import block_training
 from clsplat.blocks.block_settings import block_settings
-from clsplat.blocks.merging import region_of
+from clsplat.blocks.merging import region_of_cell
 from clsplat.blocks.plan import Block, BlockPlan, read_plan
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
@@ -279,7 +279,7 @@ def standing(model: Gaussians, scene: Scene, plan: BlockPlan) -> Gaussians:
     """Gaussians over the first block's cell, up to TALLEST above the median point."""
     up = np.array(plan.up)
     heights = (model.means + model.origin) @ up - np.median(scene.points @ up)
-    inside = region_of(plan, plan.blocks[0].cell).contains(model.means, model.origin)
+    inside = region_of_cell(plan, plan.blocks[0].cell).contains(model.means, model.origin)
     return take(model, inside & (heights < TALLEST))
 
 

@@ -16,8 +16,8 @@ class DivisionOptions:
     """Limits of a block, and the up direction by which the ground is found."""
 
     block_mem: Memory = None
-    """Device memory that the training of a block may take, such as 8GiB: that of the smallest device. If not given: the
-    memory of this device."""
+    """Most device memory that a block's training may take, such as 8GiB. Give that of the smallest device. If not
+    given: this device's memory."""
     block_photographs: OptionalInt = None
     """Largest number of photographs of a block. If not given: any number."""
     up: Annotated[str | None, arg(metavar="X,Y,Z")] = None

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -38,9 +38,11 @@ def run(verb: TrainVerb, services: Services) -> int:
     _check(verb)
     city = verb.output
     if not verb.resume:
-        _plan(verb, services)
+        # with --json, standard output has the JSON alone
+        with redirect_stdout(sys.stderr) if verb.json else nullcontext():
+            _plan(verb, services)
     plan = read_plan(city)
-    if verb.scene is not None and verb.scene.absolute() != plan.scene:
+    if verb.scene is not None and verb.scene.resolve() != plan.scene.resolve():
         raise InputError(f"{city}: its plan is of the scene {plan.scene}, not of {verb.scene}; expected a new folder")
     if verb.blocks.workers is None and verb.blocks.scheduler is None:
         _one_after_another(verb, services, plan)
