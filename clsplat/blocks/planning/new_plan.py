@@ -32,7 +32,7 @@ from clsplat.scenes.scene import Scene
 MIN_CAMERA_PLACES = 2
 """Least number of different camera positions of a block."""
 ONE_CAMERA = "one camera"
-"""What a cell has whose photographs were all taken at one place, for notes."""
+"""Reason why a cell cannot be trained if all its photographs were taken at one place."""
 MIN_LOAD_DROP = 0.95
 """Cutting goes on while each round lowers the largest load to at most this fraction of its value."""
 SLOW = "training will run in pieces, and be slower"
