@@ -157,7 +157,7 @@ def _joined(measurement: LoadMeasurement, tree: Tree) -> tuple[CellLoads, list[s
     """Measure the cells' loads, and join each cell that cannot be trained to its neighbours.
 
     Loads are measured again after each round. In a round, a cell that the round has changed is not joined again, since
-    it may be fit now.
+    it may be fit now. All other cells stay unfit, since joined cells can only take photographs from them.
     Returns the loads of the remaining cells, and a line for each joined cell. Raises InputError if only one cell
     remains and has no points or no photographs.
     """

@@ -43,7 +43,10 @@ def run(verb: TrainVerb, services: Services) -> int:
             _plan(verb, services)
     plan = read_plan(city)
     if verb.scene is not None and verb.scene.resolve() != plan.scene.resolve():
-        raise InputError(f"{city}: its plan is of the scene {plan.scene}, not of {verb.scene}; expected a new folder")
+        raise InputError(
+            f"{city}: its plan is of the scene {plan.scene}, not of {verb.scene}; expected that scene or a new folder; "
+            "if the scene was moved, repeat the command that began the training, with the new path"
+        )
     if verb.blocks.workers is None and verb.blocks.scheduler is None:
         _one_after_another(verb, services, plan)
     else:
