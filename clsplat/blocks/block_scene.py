@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from clsplat.blocks.plan import Block
+from clsplat.blocks.plan import Block, BlockPlan
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
 from clsplat.runs import scene_record
@@ -14,29 +14,30 @@ from clsplat.scenes.readers.colmap import read_cameras
 from clsplat.scenes.scene import Scene, View
 
 
-def scene_of_block(scene: Scene, block: Block, coarse: Run) -> Scene:
-    """Return the scene of a block: its photographs without held-out ones, with the length unit and extent of the whole.
+def scene_of_block(scene: Scene, plan: BlockPlan, block: Block, coarse: Run) -> Scene:
+    """Return the block's training photographs as a scene. Length unit and extent are those of the whole scene.
 
-    scene: the whole scene.
+    scene: the whole scene, which may lack photographs of other blocks.
     coarse: the coarse model's run, whose refined cameras are used.
     """
-    whole = scene_of_finish(scene, coarse)
+    whole = scene_of_finish(scene, plan, coarse)
     there = {view.name: view for view in whole.train_views}
     return replace(
         whole,
-        name=f"{scene.name}, block {block.name.replace('_', ',')}",
+        name=f"{scene.name}, block {block.shown}",
         views=[there[name] for name in sorted(block.photographs)],
-        whole_extent=scene.extent,
     )
 
 
-def scene_of_finish(scene: Scene, coarse: Run) -> Scene:
+def scene_of_finish(scene: Scene, plan: BlockPlan, coarse: Run) -> Scene:
     """Return the whole scene with the length unit of the coarse model's training, and any refined cameras.
 
+    Its extent is that in the plan, since the cameras of the scene may be fewer, or refined.
     Held-out views keep their given poses, as in the evaluation of every training.
     """
     record = scene_record.read(coarse)
-    scene = replace(scene, unit=None if record is None else scene_record.length_unit_of(record))
+    unit = None if record is None else scene_record.length_unit_of(record)
+    scene = replace(scene, unit=unit, whole_extent=plan.extent)
     if not coarse.config.refines:
         return scene
     refined = read_cameras(coarse.refined_path, coarse.config.lenses)

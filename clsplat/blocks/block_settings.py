@@ -27,7 +27,8 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, surroundi
 
     Steps of the schedule are scaled by the block's fraction of the photographs, so that a densification sees the same
     fraction of them as in a training of the whole. The SH degree is full from the start, photographs have their full
-    size, and opacities are not reset, since the Gaussians have been trained already.
+    size, and opacities are not reset, since the Gaussians have been trained already. Without resets there is no pruning
+    by size either.
     """
     whole, density, optimiser = plan.settings, plan.settings.density, plan.settings.optimiser
     passed = coarse.iterations
@@ -66,13 +67,14 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, surroundi
 def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
     """Return the settings of the finish: `steps` steps on the merged model, with the schedule's final rate of means.
 
-    No Gaussians are added or removed. All learning rates fall to FINISH_COOLDOWN_TO times their value.
+    No Gaussians are added or removed. Held-out views are evaluated once, at the end. All learning rates fall to
+    FINISH_COOLDOWN_TO times their value.
     """
     whole = plan.settings
     return replace(
         _without_events(whole, photographs=plan.photographs),
         iterations=steps,
-        eval_at=tuple(step for step in whole.eval_at if step <= steps),
+        eval_at=(),
         appearance_rate=FINISH_APPEARANCE_RATE
         * appearance_rate_of_part(whole.appearance_rate, whole.appearance, whole.iterations, steps),
         depth_weight=whole.depth_weight * DEPTH_WEIGHT_END_FRACTION,
@@ -90,7 +92,7 @@ def finish_settings(plan: BlockPlan, steps: int) -> TrainConfig:
 def _for_fewer_photographs(optimiser: OptimiserConfig, times: float) -> OptimiserConfig:
     """Return Adam's settings for a block, where a larger fraction of the photographs shows a Gaussian.
 
-    times: number of the scene's photographs, as a multiple of the block's.
+    times: the scene's number of photographs divided by the block's.
 
     In a training of the whole, a Gaussian has zero gradients in all steps that do not show it. These zeros divide
     Adam's second moment by about `times`. A view that shows the Gaussian then changes it more, by the root of `times`.

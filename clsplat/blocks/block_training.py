@@ -9,25 +9,34 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from clsplat.blocks.block_scene import scene_of_block, scene_of_finish
 from clsplat.blocks.block_settings import block_settings, finish_settings
-from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of, region_of
-from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, BlockPlan, read_plan
+from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of, region_of_cell
+from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, Block, BlockPlan, read_plan
 from clsplat.blocks.plan_check import check_plan
-from clsplat.blocks.progress_records import CITY_FILES, MERGED_FILE, check_begun, is_done, keep_done
+from clsplat.blocks.progress_records import (
+    BEGUN_FILE,
+    CITY_FILES,
+    DONE_FILE,
+    MERGED_FILE,
+    check_begun,
+    is_done,
+    keep_done,
+)
 from clsplat.blocks.surroundings import first_model_of_block
 from clsplat.config.orientation import FrameUse
 from clsplat.config.training import TrainConfig
-from clsplat.errors import InputError
-from clsplat.files.atomic import atomic_write
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files.atomic import atomic_write, remove
 from clsplat.gaussians import Gaussians
 from clsplat.runs.locks import locked
-from clsplat.runs.run import Run, is_run
+from clsplat.runs.run import Run, is_run, owned_files
 from clsplat.scenes.dataset import SceneFrame
 from clsplat.scenes.scene import Scene
+from clsplat.training.preparation import check_steps_left
 from clsplat.training.start import Start
 
 LoadScene = Callable[[TrainConfig, Path, FrameUse | SceneFrame], Scene]
@@ -47,15 +56,15 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
     plan = read_plan(city)
     block = plan.block(name)
     folder = city / BLOCKS_FOLDER / block.name
-    if is_done(folder, plan.digest):
+    if is_trained(city, plan, block):
         return False
-    with _begun(folder, plan.digest, plan.coarse):
-        if is_done(folder, plan.digest):  # another process may have finished it
+    with _begun(folder, plan.digest, plan.coarse, lambda: f"move {folder} away to train the block anew"):
+        if is_trained(city, plan, block):  # another process may have finished it
             return False
         coarse = Run.open(city / COARSE_FOLDER)
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene, photographs=block.photographs)
-        part, region = scene_of_block(scene, block, coarse), region_of(plan, block.widened)
+        part, region = scene_of_block(scene, plan, block, coarse), region_of_cell(plan, block.widened)
         model = first_model_of_block(coarse.model_path, region, part, plan.settings)
         surroundings = len(model) - block.gaussians
         config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)
@@ -69,7 +78,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
 def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devices: int = 1) -> bool:
     """Train the merged model on all photographs, and evaluate it. Returns False if that has been done before.
 
-    steps: number of steps; None for the number of the run that goes on, or else of the plan.
+    steps: number of steps; None for those of the existing run, or of the plan if there is no run.
     devices: number of devices of this machine that train it.
     Raises InputError if the blocks are not merged, if the plan does not fit the scene or the coarse model, or if
     another process writes the city's run.
@@ -78,20 +87,38 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
     merged = _merged(city, plan)
     config = finish_settings(plan, _steps(city, plan, steps)).on_devices(devices, explicit=False)
     config.check()
-    with _begun(city, plan.digest, merged):
-        same_start = is_done(city, plan.digest, merged)
-        if same_start and Run.open(city).config.iterations == config.iterations:
+    with _begun(city, plan.digest, merged, lambda: _how_to_finish_anew(city)):
+        if is_finished(city, plan, config.iterations):
             return False
+        if is_run(city):  # before config.toml gets the new number of steps
+            check_steps_left(Run.open(city), config, "--finish")
         coarse = Run.open(city / COARSE_FOLDER)
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene)
+        remove(city / DONE_FILE)  # of fewer steps: if it stayed, an interrupted training would count as finished
         run = Run.create(city, config, scene=plan.scene, resume=is_run(city), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "finish", str(city)])
         start = Start(Gaussians.load(city / MERGED_FILE), None, _with_appearance(coarse), trains_appearance=True)
-        train(scene_of_finish(scene, coarse), run, start)
+        train(scene_of_finish(scene, plan, coarse), run, start)
         _copy_refined(coarse, run)
         keep_done(city, plan.digest, merged)
     return True
+
+
+def is_trained(city: Path, plan: BlockPlan, block: Block) -> bool:
+    """True if the training of a block has finished. Raises InputError for a damaged record of it."""
+    return is_done(city / BLOCKS_FOLDER / block.name, plan.digest)
+
+
+def is_finished(city: Path, plan: BlockPlan, steps: int | None) -> bool:
+    """True if the finish has been trained on the merged models of all blocks.
+
+    steps: number of steps that the finish must have; None for any number.
+    """
+    with suppress(ClsplatError):
+        merged = merge_digest(plan, digests_of_blocks(city, plan))
+        return is_done(city, plan.digest, merged) and steps in (None, Run.open(city).config.iterations)
+    return False
 
 
 def _steps(city: Path, plan: BlockPlan, asked: int | None) -> int:
@@ -112,17 +139,27 @@ def _merged(city: Path, plan: BlockPlan) -> str:
     return wanted
 
 
-def _begun(folder: Path, plan: str, start: str) -> ExitStack:
+def _begun(folder: Path, plan: str, start: str, advice: Callable[[], str]) -> ExitStack:
     """Context that holds the write lock of a run's folder, in which a training begins or goes on.
 
-    plan, start: digests of the plan, and of the model that the training begins with. Raises InputError if an earlier
-    training in the folder had others, or if another process holds the lock.
+    plan, start: digests of the plan, and of the model that the training begins with.
+    advice: function that returns in words how to train anew, for the message.
+    Raises InputError if an earlier training in the folder had another plan or model, or if another process holds the
+    lock.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as held:
         held.enter_context(locked(folder, "blocks"))
-        check_begun(folder, plan, start)
+        check_begun(folder, plan, start, advice)
         return held.pop_all()
+
+
+def _how_to_finish_anew(city: Path) -> str:
+    """Return in words which files and folders of a city to remove, so that the finish begins anew."""
+    parts = {file.relative_to(city).parts[0] for file in owned_files(city)}
+    names = [BEGUN_FILE, DONE_FILE, *sorted(name for name in parts - CITY_FILES if not name.startswith("."))]
+    there = ", ".join(name for name in names if (city / name).exists())
+    return f"to train the finish anew, remove from this folder: {there}"
 
 
 def _with_appearance(coarse: Run) -> Path | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 
 from clsplat.blocks.plan import BLOCKS_FOLDER, BlockPlan, Rectangle, read_plan
 from clsplat.blocks.progress_records import MERGED_FILE, done_record
-from clsplat.errors import InputError, examples
+from clsplat.errors import ClsplatError, InputError, examples
 from clsplat.files.documents import digest, open_input
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import comment, recorded_space
@@ -42,7 +43,7 @@ class CellModel:
             yield take(some, self.cell.contains(some.means, some.origin))
 
 
-def region_of(plan: BlockPlan, rectangle: Rectangle) -> TrainedRegion:
+def region_of_cell(plan: BlockPlan, rectangle: Rectangle) -> TrainedRegion:
     """Return a cell of the plan, or a widened cell, as a region of the world."""
     return TrainedRegion(np.array(plan.axes), np.array(rectangle.low), np.array(rectangle.high))
 
@@ -91,7 +92,7 @@ def merge(city: Path) -> bool:
     plan = read_plan(city)
     found = digests_of_blocks(city, plan)
     wanted, target = merge_digest(plan, found), city / MERGED_FILE
-    if merged_of(target) == wanted:
+    if _has_merge(target, wanted):
         return False
     models = []
     for block, known in zip(plan.blocks, found, strict=True):
@@ -101,9 +102,23 @@ def merge(city: Path) -> bool:
                 f"{path}: is not the model that the block's training wrote; put it back, or remove "
                 f"{path.with_name('done.json')} and train the block again"
             )
-        models.append(CellModel(path, region_of(plan, block.cell)))
+        models.append(CellModel(path, region_of_cell(plan, block.cell)))
     write_merged(target, models, [comment(recorded_space(models[0].path)), f"{MERGED_COMMENT} {wanted}"])
     return True
+
+
+def is_merged(city: Path, plan: BlockPlan) -> bool:
+    """True if merged.ply has the finished models of all blocks."""
+    with suppress(ClsplatError):
+        return _has_merge(city / MERGED_FILE, merge_digest(plan, digests_of_blocks(city, plan)))
+    return False
+
+
+def _has_merge(path: Path, wanted: str) -> bool:
+    """True if the merge with the digest `wanted` wrote a file; False also for a file with a damaged header."""
+    with suppress(InputError):
+        return merged_of(path) == wanted
+    return False
 
 
 def digests_of_blocks(city: Path, plan: BlockPlan) -> list[str]:
@@ -115,7 +130,7 @@ def digests_of_blocks(city: Path, plan: BlockPlan) -> list[str]:
     for block in plan.blocks:
         record = done_record(city / BLOCKS_FOLDER / block.name)
         if record is None or record.plan != plan.digest:
-            missing.append(block.name.replace("_", ","))
+            missing.append(block.shown)
         else:
             found.append(record.model)
     if missing:

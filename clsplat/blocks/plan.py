@@ -29,8 +29,8 @@ PLAN_FORM = 1
 MARGIN = 0.2
 """Width that widens a cell on each side, as a fraction of the cell's size along the same axis."""
 SHARE = 0.25
-"""Least pixels of a photograph that a cell fills if the photograph belongs to the cell's block, as a fraction of the
-pixels that the photograph's fullest cell fills (docs/scale.md)."""
+"""A photograph belongs to a cell's block if the cell fills at least this fraction of the pixels that the photograph's
+fullest cell fills (docs/scale.md)."""
 _EXPECTED_PLAN = "a plan that clsplat blocks plan wrote"
 Pair = tuple[float, float]
 Point = tuple[float, float, float]
@@ -67,6 +67,11 @@ class Block:
     iterations: int
     gaussians: int
 
+    @property
+    def shown(self) -> str:
+        """The name as commands and messages write it, such as "0,1"."""
+        return shown_name(self.name)
+
 
 @dataclass(frozen=True)
 class Partition:
@@ -94,10 +99,10 @@ class BlockPlan:
         its dot products with them.
     margin, share: as MARGIN and SHARE.
     coarse: SHA-256 of the coarse model's file.
-    scene_digest: digest of the scene record of the coarse model's run.
+    extent: the whole scene's extent in world units (`Scene.extent`).
     finish_steps: number of steps over all photographs after the merge.
     blocks: in the order in which the merge joins them.
-    joined: for each cell that was joined to its neighbours, the reason in words.
+    joined: in words, for each cell that was joined to its neighbours, the reason, and what a single block lacks.
     photographs: number of the scene's training views.
     gaussians: number of the coarse model's Gaussians.
     """
@@ -110,7 +115,7 @@ class BlockPlan:
     margin: float
     share: float
     coarse: str
-    scene_digest: str
+    extent: float
     finish_steps: int
     blocks: tuple[Block, ...]
     joined: tuple[str, ...] = ()
@@ -128,7 +133,7 @@ class BlockPlan:
         for block in self.blocks:
             if block.name == name.replace(",", "_").replace(" ", ""):
                 return block
-        names = examples([block.name.replace("_", ",") for block in self.blocks], 8)
+        names = examples([block.shown for block in self.blocks], 8)
         raise InputError(f"--block {name}: the plan has no such block, expected one of {names}")
 
     def document(self) -> dict[str, Any]:
@@ -138,8 +143,8 @@ class BlockPlan:
             "clsplat_blocks": PLAN_FORM,
             "clsplat": package_version(),
             "scene": str(self.scene),
-            "scene_digest": self.scene_digest,
             "coarse": self.coarse,
+            "extent": self.extent,
             "division": {
                 "blocks": division.blocks,
                 "memory": division.memory,
@@ -166,6 +171,11 @@ class BlockPlan:
                 for block in self.blocks
             ],
         }
+
+
+def shown_name(name: str) -> str:
+    """Return the name of a block, such as "0_1", as commands and messages write it: "0,1"."""
+    return name.replace("_", ",")
 
 
 def write_plan(city: Path, plan: BlockPlan) -> None:
@@ -204,7 +214,7 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
         margin=_number(document["margin"]),
         share=_number(document["share"]),
         coarse=_text(document["coarse"]),
-        scene_digest=_text(document["scene_digest"]),
+        extent=_number(document["extent"]),
         finish_steps=_count(document["finish_steps"]),
         blocks=tuple(_block_of(block) for block in document["blocks"]),
         joined=tuple(_text(line) for line in document["joined"]),

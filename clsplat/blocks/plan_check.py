@@ -8,7 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE, BlockPlan, Partition, Point, read_plan
+from clsplat.blocks.plan import (
+    BLOCKS_FOLDER,
+    COARSE_FOLDER,
+    PLAN_FILE,
+    BlockPlan,
+    Partition,
+    Point,
+    read_plan,
+    write_plan,
+)
 from clsplat.blocks.planning.ground import ground_of
 from clsplat.blocks.progress_records import CITY_FILES
 from clsplat.config.training import TrainConfig
@@ -65,9 +74,12 @@ def check_new_plan(city: Path) -> None:
     check_output(city, resume=is_run(city), overwrite=False, beside=CITY_FILES)
 
 
-def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Partition, up: Point | None) -> BlockPlan | None:
+def kept_plan(
+    city: Path, source: Path, scene: Scene, config: TrainConfig, division: Partition, up: Point | None
+) -> BlockPlan | None:
     """Return the plan in a city's folder if it was made for this scene with these options.
 
+    source: path of the scene. If the scene was moved, its path in plan.json is replaced.
     division, up: the options of the division; None for an up direction that is estimated.
     Returns None if there is no plan, or one with another division by which no block has begun. Raises InputError like
     `check_plan`, and for another division if a block has begun.
@@ -89,6 +101,9 @@ def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Partition
         if was != given
     ]
     if not changed:
+        if plan.scene.resolve() != source.resolve():
+            plan = replace(plan, scene=source.absolute())  # the digest is without the path, so blocks go on
+            write_plan(city, plan)
         return plan
     if (city / BLOCKS_FOLDER).exists():
         raise InputError(
@@ -101,6 +116,8 @@ def kept_plan(city: Path, scene: Scene, config: TrainConfig, division: Partition
 def check_coarse(coarse: Run, wanted: TrainConfig, scene: Scene, config: TrainConfig) -> bool:
     """Check that the coarse model is trained on a scene with the wanted settings. Returns True if it is finished.
 
+    It is finished once its run has the model, the learnt appearance and the refined cameras.
+
     wanted: settings for the training of the coarse model.
     scene, config: the scene at the size of the whole, and the settings of the whole.
     Raises InputError that lists the differences.
@@ -111,13 +128,23 @@ def check_coarse(coarse: Run, wanted: TrainConfig, scene: Scene, config: TrainCo
             f"{coarse.config_path}: has other settings: {examples(changed)}; expected the same, or a new folder for a "
             "new plan"
         )
-    finished = coarse.model_path.exists() and coarse.model_record().get("step") == coarse.config.iterations
+    finished = _has_results(coarse) and coarse.model_record().get("step") == coarse.config.iterations
     if finished and (changed := scene_differences(coarse, scene, config)):
         raise InputError(
             f"{coarse.path}: was trained on another scene than {scene.source or scene.name} is now: "
             f"{'; '.join(changed)}; expected the same views and photographs, or a new folder for a new plan"
         )
     return finished
+
+
+def _has_results(coarse: Run) -> bool:
+    """True if a run has all files that the blocks read, of which a stopped training may have written only some."""
+    wanted = [coarse.model_path]
+    if coarse.config.appearance != "none":
+        wanted.append(coarse.appearance_path)
+    if coarse.config.refines:
+        wanted += [coarse.refined_path / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
+    return all(path.exists() for path in wanted)
 
 
 def settings_differences(planned: TrainConfig, now: TrainConfig, where: str = "in the plan") -> list[str]:
@@ -166,8 +193,8 @@ def scene_differences(
     now = scene_record.record_of(replace(scene, views=views), earlier["resolution"])
     # `origin` comes from all cameras, so it is not known from a part of the views
     earlier = {**earlier, "views": {name: view for name, view in earlier["views"].items() if name in names}}
-    # The coarse model's photographs have another size. So have the sky's points another number, and points without
-    # colours other colours.
+    # The coarse model's photographs are smaller, so the sky has another number of points. Points without colours get
+    # other colours.
     if settings.sky:
         now["points"] = earlier["points"]
     return scene_record.differences(earlier, now, moved=True)

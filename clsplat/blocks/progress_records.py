@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -38,10 +39,11 @@ class DoneRecord:
     model: str
 
 
-def check_begun(run: Path, plan: str, start: str) -> None:
+def check_begun(run: Path, plan: str, start: str, advice: Callable[[], str]) -> None:
     """Record that a training begins in the folder `run`, or check that it began like this.
 
     plan, start: as for `DoneRecord`.
+    advice: function that returns in words how to train anew, for the message.
     Raises InputError if the training in the folder began by another plan, or with another model.
     """
     path = run / BEGUN_FILE
@@ -53,8 +55,7 @@ def check_begun(run: Path, plan: str, start: str) -> None:
     for name, now, what in (("plan", plan, "by another plan"), ("start", start, "with another model")):
         if record.get(name) != now:
             raise InputError(
-                f"{run}: its training began {what} ({name} {str(record.get(name))[:12]}, now {now[:12]}); move the "
-                "folder away to train anew"
+                f"{run}: its training began {what} ({name} {str(record.get(name))[:12]}, now {now[:12]}); {advice()}"
             )
 
 

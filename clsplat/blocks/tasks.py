@@ -9,10 +9,9 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of
+from clsplat.blocks.block_training import is_finished, is_trained
+from clsplat.blocks.merging import is_merged
 from clsplat.blocks.plan import BLOCKS_FOLDER, BlockPlan
-from clsplat.blocks.progress_records import MERGED_FILE, is_done
-from clsplat.errors import ClsplatError
 from clsplat.jobs.task import JobTask
 
 METRICS_END_BYTES = 1 << 16
@@ -22,16 +21,16 @@ METRICS_END_BYTES = 1 << 16
 def tasks_of(city: Path, plan: BlockPlan, steps: int | None, machine: Sequence[str] = ()) -> list[JobTask]:
     """Return the tasks of a city.
 
-    steps: number of steps of the finish; None for the plan's.
+    steps: number of steps of the finish; None for those of the existing run, or of the plan if there is no run.
     machine: flags about device and memory, for the commands that train.
     """
-    words, digest = ("clsplat", "blocks"), plan.digest
+    words = ("clsplat", "blocks")
     place = str(city.absolute())
     tasks = [
         JobTask(
             f"block-{block.name}",
-            (*words, "train", place, "--block", block.name.replace("_", ","), *machine),
-            partial(is_done, city / BLOCKS_FOLDER / block.name, digest),
+            (*words, "train", place, "--block", block.shown, *machine),
+            partial(is_trained, city, plan, block),
             progress=partial(steps_done, city / BLOCKS_FOLDER / block.name),
             total=block.iterations,
         )
@@ -44,27 +43,13 @@ def tasks_of(city: Path, plan: BlockPlan, steps: int | None, machine: Sequence[s
         JobTask(
             "finish",
             (*words, "finish", place, *more, *machine),
-            partial(is_finished, city, plan),
+            partial(is_finished, city, plan, steps),
             ("merge",),
             partial(steps_done, city),
             steps or plan.finish_steps,
         )
     )
     return tasks
-
-
-def is_merged(city: Path, plan: BlockPlan) -> bool:
-    """True if merged.ply has the models of all blocks."""
-    with suppress(ClsplatError):
-        return merged_of(city / MERGED_FILE) == merge_digest(plan, digests_of_blocks(city, plan))
-    return False
-
-
-def is_finished(city: Path, plan: BlockPlan) -> bool:
-    """True if the finish of the merged models of all blocks is done."""
-    with suppress(ClsplatError):
-        return is_done(city, plan.digest, merge_digest(plan, digests_of_blocks(city, plan)))
-    return False
 
 
 def steps_done(run: Path) -> int:

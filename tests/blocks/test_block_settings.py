@@ -32,7 +32,7 @@ def plan_of(whole: TrainConfig, share: int = 100) -> BlockPlan:
         margin=0.2,
         share=0.02,
         coarse="c",
-        scene_digest="s",
+        extent=1.0,
         finish_steps=350,
         blocks=(block,),
         photographs=400,
@@ -97,5 +97,5 @@ def test_the_finish_ends_with_small_rates_and_moves_no_rows() -> None:
     assert found.iterations == found.optimiser.cooldown == 350
     assert found.optimiser.means_rate == found.optimiser.means_rate_end == WHOLE.optimiser.means_rate_end
     assert (found.density.every, found.density.prune_every, found.density.growth) == (0, 0, "paper")
-    assert found.eval_at == (100,)
+    assert found.eval_at == (), "the city is evaluated once, at the end"
     assert not found.refines

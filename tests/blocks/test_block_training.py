@@ -11,15 +11,19 @@ import numpy as np
 import pytest
 from calls import refusal
 from compare import assert_same_bits
-from small_city import BLOCK_STEPS, FINISH_STEPS, in_cell, load, trains_on
+from small_city import BLOCK_STEPS, FINISH_STEPS, WHOLE, in_cell, load, trains_on
 
-from clsplat.blocks.block_training import finish, train_block
-from clsplat.blocks.merging import merge
+from clsplat.blocks.block_training import finish, is_finished, train_block
+from clsplat.blocks.merging import is_merged, merge
 from clsplat.blocks.plan import read_plan
+from clsplat.blocks.tasks import tasks_of
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.runs.scene_record import read
+from clsplat.scenes.loading import load_scene_of
+from clsplat.scenes.scene import Scene
+from clsplat.training.start import Start
 
 BLOCKS = ("0,0", "1,0")
 
@@ -92,8 +96,62 @@ def test_a_longer_finish_goes_on(done_city: Path, tmp_path: Path, default_device
     city = shutil.copytree(done_city, tmp_path / "city")
     assert finish(city, FINISH_STEPS + 4, load(), trains_on(default_device))
     assert Run.open(city).checkpoints()[-1][0] == FINISH_STEPS + 4
-    assert "is already at step" in refusal(lambda: finish(city, 2, load(), trains_on(default_device)))
+    before = (city / "config.toml").read_bytes()
+    assert "--finish 2: " in (said := refusal(lambda: finish(city, 2, load(), trains_on(default_device))))
+    assert "is already at step" in said
+    assert (city / "config.toml").read_bytes() == before, "a refused number of steps changes nothing"
+    assert is_finished(city, read_plan(city), FINISH_STEPS + 4)
     assert "--finish 0: expected at least 1 step" in refusal(lambda: finish(city, 0, load(), trains_on(default_device)))
+
+
+@pytest.mark.parametrize("again", [None, FINISH_STEPS + 4])
+def test_a_stopped_longer_finish_goes_on(
+    done_city: Path, tmp_path: Path, default_device: Device, again: int | None
+) -> None:
+    city = shutil.copytree(done_city, tmp_path / "city")
+    plan = read_plan(city)
+    assert is_finished(city, plan, None)
+    assert not is_finished(city, plan, FINISH_STEPS + 4), "the task of a longer finish has something to do"
+    with pytest.raises(KeyboardInterrupt):
+        finish(city, FINISH_STEPS + 4, load(), trains_on(default_device, FINISH_STEPS + 1))
+    assert not is_finished(city, plan, None)
+    assert finish(city, again, load(), trains_on(default_device))
+    assert Run.open(city).model_record()["step"] == FINISH_STEPS + 4
+    assert not finish(city, again, load(), trains_on(default_device))
+
+
+def test_the_tasks_of_a_finished_city_are_done_up_to_its_steps(done_city: Path) -> None:
+    plan = read_plan(done_city)
+    assert all(task.is_done() for task in tasks_of(done_city, plan, None))
+    *others, last = tasks_of(done_city, plan, FINISH_STEPS + 1)
+    assert all(task.is_done() for task in others)
+    assert not last.is_done()
+
+
+def test_a_finish_on_another_merge_says_what_to_remove(done_city: Path, tmp_path: Path, default_device: Device) -> None:
+    city = shutil.copytree(done_city, tmp_path / "city")
+    (city / "letter.txt").write_text("the user's own")
+    begun = json.loads((city / "begun.json").read_text())
+    (city / "begun.json").write_text(json.dumps({**begun, "start": "0" * 64}))
+    (city / "done.json").unlink()
+    said = refusal(lambda: finish(city, None, load(), trains_on(default_device)))
+    assert "its training began with another model (start 000000000000" in said
+    named = said.partition("remove from this folder: ")[2].split(", ")
+    assert {"begun.json", "config.toml", "model.ply", "checkpoints"} <= set(named)
+    assert not {"merged.ply", "plan.json", "blocks", "coarse", "letter.txt"} & set(named)
+    (city / "letter.txt").unlink()  # a new run's folder has no foreign files
+    for name in named:
+        shutil.rmtree(city / name) if (city / name).is_dir() else (city / name).unlink()
+    assert finish(city, None, load(), trains_on(default_device))
+    assert (city / "model.ply").read_bytes() == (done_city / "model.ply").read_bytes()
+
+
+def test_a_damaged_merge_is_written_anew(done_city: Path, tmp_path: Path) -> None:
+    city = shutil.copytree(done_city, tmp_path / "city")
+    (city / "merged.ply").write_bytes(b"no PLY")
+    assert not is_merged(city, read_plan(city))
+    assert merge(city)
+    assert (city / "merged.ply").read_bytes() == (done_city / "merged.ply").read_bytes()
 
 
 def test_what_is_not_finished_is_named(city: Path, default_device: Device) -> None:
@@ -152,7 +210,14 @@ def test_a_missing_photograph_is_named(
     plan["scene"] = str(scene)
     (city / "plan.json").write_text(json.dumps(plan))
     (scene / "images" / "09.png").unlink()
-    assert train_block(city, "0,0", load(), trains_on(default_device)), "the block does not have this photograph"
+    units = list[float]()
+
+    def train(scene: Scene, run: Run, start: Start) -> object:
+        units.append(scene.extent)
+        return trains_on(default_device)(scene, run, start)
+
+    assert train_block(city, "0,0", load(), train), "the block does not have this photograph"
+    assert units == [load_scene_of(WHOLE, small_scene).extent], "that of the whole, with the missing camera"
     assert "1 view missing now (09.png)" in refusal(lambda: train_block(city, "1,0", load(), trains_on(default_device)))
 
 

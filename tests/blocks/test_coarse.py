@@ -5,7 +5,13 @@ from __future__ import annotations
 
 import pytest
 
-from clsplat.blocks.planning.coarse import block_steps, coarse_settings, coarse_steps, finish_steps
+from clsplat.blocks.planning.coarse import (
+    block_steps,
+    coarse_settings,
+    coarse_steps,
+    finish_steps,
+    without_density_control,
+)
 from clsplat.config.presets import bundled, stretched
 from clsplat.config.training import TrainConfig
 
@@ -23,6 +29,14 @@ def test_the_coarse_model_has_a_shorter_schedule_at_half_the_size() -> None:
 def test_a_short_schedule_still_has_eight_densifications() -> None:
     coarse = coarse_settings(bundled("default", "short", 3000), 800)
     assert (coarse.density.start, coarse.density.stop, coarse.density.every) == (75, 321, 30)  # 246 steps
+
+
+def test_density_control_that_ends_with_the_coarse_model_is_named() -> None:
+    whole = TrainConfig(iterations=1000)  # the coarse model has 150 steps
+    assert without_density_control(whole.changed("density.stop", 151)) == []
+    (line,) = without_density_control(whole.changed("density.stop", 150))
+    assert line.startswith("density.stop is 150, but blocks begin after step 150")
+    assert without_density_control(whole.changed("density.stop", 150).changed("density.every", 0)) == []
 
 
 def test_other_kinds_of_density_control() -> None:

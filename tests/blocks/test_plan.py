@@ -15,10 +15,12 @@ import pytest
 from small_city import WHOLE
 
 from clsplat.blocks import plan as plans
+from clsplat.blocks import plan_check
 from clsplat.blocks.plan import PLAN_FILE, Block, BlockPlan, Partition, Rectangle, read_plan, write_plan
-from clsplat.blocks.plan_check import check_plan, kept_plan
+from clsplat.blocks.plan_check import check_coarse, check_plan, kept_plan
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
+from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene_of
 
 WEST, EAST = Rectangle((-inf, -inf), (0.1 + 0.2, inf)), Rectangle((0.1 + 0.2, -inf), (inf, inf))
@@ -31,7 +33,7 @@ PLAN = BlockPlan(
     margin=0.2,
     share=0.25,
     coarse="c" * 64,
-    scene_digest="d" * 32,
+    extent=120.1,
     finish_steps=7,
     blocks=(Block("0_0", WEST, WEST, ("a.jpg", "b ü.jpg"), 30, 1000), Block("1_0", EAST, EAST, ("c.jpg",), 20, 900)),
     joined=("block 1,1 has no points: its cell is joined to block 1,0",),
@@ -140,15 +142,42 @@ def test_another_coarse_model_is_refused(city: Path, small_scene: Path) -> None:
         check_plan(city, load_scene_of(WHOLE, small_scene))
 
 
+def test_a_moved_scene_keeps_its_plan(city: Path, small_scene: Path, tmp_path: Path) -> None:
+    plan, moved = read_plan(city), shutil.copytree(small_scene, tmp_path / "moved")
+    (city / "blocks" / "0_0").mkdir(parents=True)
+    found = kept_plan(city, moved, load_scene_of(WHOLE, moved), WHOLE, plan.division, plan.up)
+    assert found == read_plan(city) == replace(plan, scene=moved)
+    assert found.digest == plan.digest
+
+
+@pytest.mark.parametrize("lost", ["model.ply", "appearance.json", "refined"])
+def test_a_coarse_model_without_all_results_is_not_finished(
+    city: Path, small_scene: Path, monkeypatch: pytest.MonkeyPatch, lost: str
+) -> None:
+    """The training writes the model first, so a kill may leave it alone."""
+    coarse = Run.open(city / "coarse")
+    coarse.config = replace(coarse.config, appearance="exposure", refine_poses=True)
+    monkeypatch.setattr(plan_check, "scene_differences", lambda *_: [])
+    scene = load_scene_of(WHOLE, small_scene)
+    assert not check_coarse(coarse, coarse.config, scene, WHOLE)
+    coarse.appearance_path.touch()
+    coarse.refined_path.mkdir()
+    for name in ("cameras", "images", "points3D"):
+        (coarse.refined_path / f"{name}.txt").touch()
+    assert check_coarse(coarse, coarse.config, scene, WHOLE)
+    shutil.move(coarse.path / lost, city.parent)
+    assert not check_coarse(coarse, coarse.config, scene, WHOLE)
+
+
 def test_a_plan_with_other_options_is_made_anew_until_blocks_are_trained(city: Path, small_scene: Path) -> None:
     scene, plan = load_scene_of(WHOLE, small_scene), read_plan(city)
-    assert kept_plan(city, scene, WHOLE, plan.division, plan.up) == plan
-    assert kept_plan(city, scene, WHOLE, Partition("3"), plan.up) is None
-    assert kept_plan(city, scene, WHOLE, plan.division, (0.0, -1.0, 1e-5)) == plan
-    assert kept_plan(city, scene, WHOLE, plan.division, (0.0, 0.0, 1.0)) is None
+    assert kept_plan(city, small_scene, scene, WHOLE, plan.division, plan.up) == plan
+    assert kept_plan(city, small_scene, scene, WHOLE, Partition("3"), plan.up) is None
+    assert kept_plan(city, small_scene, scene, WHOLE, plan.division, (0.0, -1.0, 1e-5)) == plan
+    assert kept_plan(city, small_scene, scene, WHOLE, plan.division, (0.0, 0.0, 1.0)) is None
     (city / "blocks" / "0_0").mkdir(parents=True)
     with pytest.raises(InputError, match=r"--blocks is 2 in the plan and 3 now.*expected the same"):
-        kept_plan(city, scene, WHOLE, Partition("3"), plan.up)
+        kept_plan(city, small_scene, scene, WHOLE, Partition("3"), plan.up)
     with pytest.raises(InputError, match="--up is 0,-1,0 in the plan and 0,0,1 now"):
-        kept_plan(city, scene, WHOLE, plan.division, (0.0, 0.0, 2.0))
-    assert kept_plan(city, scene, WHOLE, plan.division, plan.up) == plan
+        kept_plan(city, small_scene, scene, WHOLE, plan.division, (0.0, 0.0, 2.0))
+    assert kept_plan(city, small_scene, scene, WHOLE, plan.division, plan.up) == plan

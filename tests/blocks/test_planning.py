@@ -142,3 +142,23 @@ def test_a_cell_without_photographs_is_joined() -> None:
     measured.__dict__["places"] = on_street(np.arange(0, 80, 2) + 25.0)
     loads, notes = divided(measured, Partition("2"))
     assert notes == ["block 1,0 has no photographs: its cell is joined to block 0,0"]
+
+
+def test_no_more_cells_are_joined_than_needed() -> None:
+    """Two neighbours that have one camera each make one cell with two, which stays."""
+    cameras = [0.0, 1.0, 2.0, 3.0, 20.0, 20.0, 30.0, 30.0]
+    loads, notes = divided(GivenLoads(cameras, np.arange(0, 34, 0.5), 2.0), Partition("4"))
+    assert notes == ["block 1,0 has one camera: its cell is joined to block 1,1"]
+    assert len(loads.names) == 3
+    assert "1_1" in loads.names
+    assert loads.belongs.sum(axis=0).tolist()[-1] == 4
+
+
+def test_a_scene_that_cannot_be_trained_is_refused() -> None:
+    nothing = GivenLoads(np.arange(0, 20, 2), np.arange(500, 520, 0.5), 5.0)
+    nothing.scene = cast("Any", SimpleNamespace(source="survey", name="survey"))
+    with pytest.raises(InputError, match="survey: the only block has no photographs, expected points of the coarse"):
+        divided(nothing, Partition("2"))
+    loads, notes = divided(GivenLoads(np.full(4, 3.0), np.arange(0, 20, 0.5), 5.0), Partition("2"))
+    assert len(notes) == 1 and notes[0].startswith("block 0,0 has one camera, and there is no other block")
+    assert loads.names == ("0_0",)

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +31,10 @@ def in_blocks(scene: Path, city: Path, *flags: str, services: Services | None = 
 @pytest.fixture(scope="module")
 def whole(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A city that one command has trained in this process."""
-    city = tmp_path_factory.mktemp("whole") / "city"
-    assert in_blocks(small_scene, city) == 0
+    city, printed = tmp_path_factory.mktemp("whole") / "city", StringIO()
+    with redirect_stdout(printed):
+        assert in_blocks(small_scene, city, "--json") == 0
+    assert json.loads(printed.getvalue())["step"] == 3, "standard output has the JSON alone"
     return city
 
 
@@ -57,12 +61,20 @@ def test_the_same_command_again_and_resume_do_nothing(whole: Path, small_scene: 
     before = {file: file.stat().st_mtime_ns for file in whole.rglob("*.ply")}
     capsys.readouterr()
     assert in_blocks(small_scene, whole, "--json") == 0
-    assert json.loads(capsys.readouterr().out.partition("{")[2].join(["{", ""]))["step"] == 3
+    assert json.loads(capsys.readouterr().out)["step"] == 3
     assert main(["train", "-o", str(whole), "--resume", "--device", "cpu"]) == 0
     said = capsys.readouterr().err
     assert "block 0,0 has finished before" in said
     assert f"model in {whole / 'model.ply'}" in said
     assert {file: file.stat().st_mtime_ns for file in before} == before
+
+
+def test_a_link_to_the_scene_is_the_same_scene(whole: Path, small_scene: Path, tmp_path: Path) -> None:
+    (link := tmp_path / "link").symlink_to(small_scene)
+    before = (whole / "plan.json").read_bytes()
+    assert in_blocks(link, whole) == 0
+    assert main(["train", str(link), "-o", str(whole), "--resume", "--device", "cpu"]) == 0
+    assert (whole / "plan.json").read_bytes() == before
 
 
 def test_command_by_command_in_another_order(whole: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -139,6 +151,19 @@ def test_wrong_calls_are_refused(whole: Path, small_scene: Path, tmp_path: Path,
     ):
         assert message in rejected(capsys, words), words
     assert not (tmp_path / "run").exists()
+
+
+def test_finished_trainings_open_no_device(whole: Path, capsys: Capture) -> None:
+    def forbidden(*_: object, **__: object) -> Any:
+        raise AssertionError("no device is opened")
+
+    services, city = Services(open_device=forbidden, open_devices=forbidden), str(whole)
+    assert main(["blocks", "train", city, "--block", "1,0"], services) == 0
+    assert main(["blocks", "train", city, "--block", "01"], services) == 0
+    assert main(["blocks", "finish", city], services) == 0
+    capsys.readouterr()
+    assert main(["blocks", "train", city, "--block", "9" * 5000], services) == 0
+    assert "the plan has 2 blocks, so there is nothing to do" in capsys.readouterr().err
 
 
 def test_a_damaged_plan_is_one_line(whole: Path, tmp_path: Path, capsys: Capture) -> None:

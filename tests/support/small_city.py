@@ -18,7 +18,6 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.files.documents import digest
 from clsplat.gaussians import Gaussians
-from clsplat.runs import scene_record
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene_of
 from clsplat.scenes.scene import Scene
@@ -35,8 +34,6 @@ def write_city(city: Path, scene: Path, device: Device, config: TrainConfig = WH
     half = replace(config, iterations=COARSE_STEPS, resolution=24, warmup=(), eval_at=())
     run = Run.create(city / COARSE_FOLDER, half, scene=scene)
     train(load_scene_of(half, scene), half, run=run, device=device)
-    record = scene_record.read(run)
-    assert record is not None
     whole, coarse = load_scene_of(config, scene), Gaussians.load(run.model_path)
     plan = BlockPlan(
         scene=scene.absolute(),
@@ -47,7 +44,7 @@ def write_city(city: Path, scene: Path, device: Device, config: TrainConfig = WH
         margin=0.2,
         share=0.02,
         coarse=digest(run.model_path),
-        scene_digest=scene_record.digest_of(record),
+        extent=whole.extent,
         finish_steps=FINISH_STEPS,
         blocks=blocks_of(whole, coarse),
         photographs=len(whole.train_views),

@@ -17,7 +17,7 @@ from quality.trainings import Rows, call, trained, words_of
 from clsplat.arrays import Float32, Float64
 from clsplat.blocks import block_training
 from clsplat.blocks.block_settings import block_settings
-from clsplat.blocks.merging import region_of
+from clsplat.blocks.merging import region_of_cell
 from clsplat.blocks.plan import Block, BlockPlan, read_plan
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
@@ -186,7 +186,7 @@ def city_of(given: Namespace, town: Path, name: str, settings: str, planned: Pat
         )
         return city
     for block in read_plan(city).blocks:
-        call(["blocks", "train", str(city), "--block", block.name.replace("_", ",")])
+        call(["blocks", "train", str(city), "--block", block.shown])
     call(["blocks", "merge", str(city)])
     call(["blocks", "finish", str(city)])
     return city
@@ -268,7 +268,7 @@ def floaters(given: Namespace, renderer: Renderer, scene: Scene, cities: dict[st
         pairs = list(zip(found, wanted, strict=True))
         more = np.mean([np.maximum(one.alpha - other.alpha, 0)[other.alpha < 0.1].mean() for one, other in pairs])
         psnr = np.mean([-10 * np.log10(np.square(one.image - other.image).mean()) for one, other in pairs])
-        yield plan.blocks[0].name.replace("_", ","), name, f"{100 * more:.2f} %", f"{psnr:.2f}"
+        yield plan.blocks[0].shown, name, f"{100 * more:.2f} %", f"{psnr:.2f}"
         pictures.append(found[0].image)
     strip = np.clip(np.concatenate(pictures, axis=1), 0, 1).astype(np.float32)
     write_image(given.folder / "pictures" / "outside-whole-frozen-without.png", strip)
@@ -279,7 +279,7 @@ def standing(model: Gaussians, scene: Scene, plan: BlockPlan) -> Gaussians:
     """Gaussians over the first block's cell, up to TALLEST above the median point."""
     up = np.array(plan.up)
     heights = (model.means + model.origin) @ up - np.median(scene.points @ up)
-    inside = region_of(plan, plan.blocks[0].cell).contains(model.means, model.origin)
+    inside = region_of_cell(plan, plan.blocks[0].cell).contains(model.means, model.origin)
     return take(model, inside & (heights < TALLEST))
 
 

@@ -25,7 +25,9 @@ def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
     config: settings of the training of the whole.
     longest: longest side of the photographs at the size of the whole, in pixels.
     The schedule is shortened, with three exceptions. The number of steps between densifications stays, unless there
-    would be fewer than MIN_DENSIFICATIONS. Opacities are never reset, because there is no time to recover from it.
+    would be fewer than MIN_DENSIFICATIONS. Opacities are not reset, because the training is too short to recover from a
+    reset. This also turns off pruning by size. With a white background, opacities are still reset once, at
+    density.start.
     Gains take steps as large as in the whole's training: a short training would take larger ones, too large for the few
     steps in which a photograph is shown.
     """
@@ -44,6 +46,20 @@ def coarse_settings(config: TrainConfig, longest: int) -> TrainConfig:
         ),
         density=density,
     )
+
+
+def without_density_control(config: TrainConfig) -> list[str]:
+    """Return a warning if blocks have no density control, because that of the whole stops before; else an empty list.
+
+    config: settings of the training of the whole.
+    """
+    density, passed = config.density, coarse_steps(config)
+    if density.every == 0 or density.stop > passed:
+        return []
+    known = (
+        f"density.stop is {density.stop}, but blocks begin after step {passed}, where the coarse model's training ends"
+    )
+    return [f"{known}: blocks add and remove no Gaussians; expected --density.stop above {passed}"]
 
 
 def coarse_steps(config: TrainConfig) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Partition
+from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Partition, shown_name
 from clsplat.blocks.planning.coarse import block_steps, finish_steps
 from clsplat.blocks.planning.measurement import CellLoads, LoadMeasurement
 from clsplat.blocks.planning.split import (
@@ -31,9 +31,10 @@ from clsplat.scenes.scene import Scene
 
 MIN_CAMERA_PLACES = 2
 """Least number of different camera positions of a block."""
+ONE_CAMERA = "one camera"
+"""Reason why a cell cannot be trained if all its photographs were taken at one place."""
 MIN_LOAD_DROP = 0.95
-"""Cuts for a limit go on as long as each round multiplies the largest load by at most this factor."""
-
+"""Cutting goes on while each round lowers the largest load to at most this fraction of its value."""
 SLOW = "training will run in pieces, and be slower"
 """Effect of too little device memory, for warnings."""
 
@@ -52,8 +53,6 @@ def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division:
         own = tuple(photographs[photograph] for photograph in np.flatnonzero(loads.belongs[:, index]))
         steps, gaussians = block_steps(config, len(own), len(photographs)), round(float(loads.around[index]))
         blocks.append(Block(name, loads.cells[index], loads.widened[index], own, steps, gaussians))
-    record = scene_record.read(coarse)
-    assert record is not None, "the training of the coarse model has written it"
     return BlockPlan(
         scene=source.absolute(),
         settings=config,
@@ -63,7 +62,7 @@ def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division:
         margin=MARGIN,
         share=SHARE,
         coarse=known_digest(coarse.model_path),
-        scene_digest=scene_record.digest_of(record),
+        extent=measurement.scene.extent,
         finish_steps=finish_steps(config),
         blocks=tuple(blocks),
         joined=tuple(joined),
@@ -157,20 +156,43 @@ def _memory_limit(measurement: LoadMeasurement, division: Partition) -> float:
 def _joined(measurement: LoadMeasurement, tree: Tree) -> tuple[CellLoads, list[str]]:
     """Measure the cells' loads, and join each cell that cannot be trained to its neighbours.
 
-    Returns the loads of the remaining cells, and a line for each joined cell.
+    Loads are measured again after each round. In a round, a cell that the round has changed is not joined again, since
+    it may be fit now. All other cells stay unfit, since joined cells can only take photographs from them.
+    Returns the loads of the remaining cells, and a line for each joined cell. Raises InputError if only one cell
+    remains and has no points or no photographs.
     """
     notes: list[str] = []
     while True:
         loads = measurement.of(tree)
         unfit = {name: why for index, name in enumerate(loads.names) if (why := _unfit(measurement, loads, index))}
-        if not unfit or isinstance(tree, Leaf):
+        if not unfit:
             return loads, notes
+        if isinstance(tree, Leaf):
+            return loads, [*notes, _note_of_single(measurement, unfit[tree.name])]
+        changed: set[str] = set()
         for name, why in unfit.items():
-            if isinstance(tree, Leaf):
-                break
-            tree, neighbours = without(tree, name)
-            joined = examples([neighbour.replace("_", ",") for neighbour in neighbours])
-            notes.append(f"block {name.replace('_', ',')} has {why}: its cell is joined to block {joined}")
+            after, neighbours = without(tree, name)
+            if changed.isdisjoint((name, *neighbours)):
+                tree = after
+                changed.update((name, *neighbours))
+                joined = examples([shown_name(neighbour) for neighbour in neighbours])
+                notes.append(f"block {shown_name(name)} has {why}: its cell is joined to block {joined}")
+
+
+def _note_of_single(measurement: LoadMeasurement, why: str) -> str:
+    """Return a note about the only cell, which has no neighbours. why: what the cell has, as from `_unfit`.
+
+    Raises InputError if nothing can be trained.
+    """
+    if why == ONE_CAMERA:
+        return (
+            "block 0,0 has one camera, and there is no other block to join it to; expected photographs from two places"
+        )
+    scene = measurement.scene
+    raise InputError(
+        f"{scene.source or scene.name}: the only block has {why}, expected points of the coarse model, and photographs "
+        "that show them; check the scene's cameras"
+    )
 
 
 def _unfit(measurement: LoadMeasurement, loads: CellLoads, index: int) -> str:
@@ -180,4 +202,4 @@ def _unfit(measurement: LoadMeasurement, loads: CellLoads, index: int) -> str:
         return "no points"
     if not len(own):
         return "no photographs"
-    return "one camera" if len(np.unique(own, axis=0)) < MIN_CAMERA_PLACES else ""
+    return ONE_CAMERA if len(np.unique(own, axis=0)) < MIN_CAMERA_PLACES else ""

@@ -34,7 +34,7 @@ def plan_table(plan: BlockPlan) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("block", "photographs", "Gaussians", "steps")]
     for block in plan.blocks:
         loads = (len(block.photographs), block.gaussians, block.iterations)
-        rows.append((_shown(block), *(f"{load:,}" for load in loads)))
+        rows.append((block.shown, *(f"{load:,}" for load in loads)))
     return rows
 
 
@@ -125,7 +125,7 @@ def _label(block: Block, pixel: Callable[[Pair], Pair]) -> str:
     """Name of a block in the middle of its cell, and its loads if they fit."""
     (left, bottom), (right, top) = pixel(block.cell.low), pixel(block.cell.high)
     middle, y = 0.5 * (left + right), 0.5 * (top + bottom)
-    lines = [f"block {_shown(block)}"]
+    lines = [f"block {block.shown}"]
     if min(right - left, bottom - top) >= DETAILS_SIDE_PX:
         lines += [
             f"{len(block.photographs):,} photographs",
@@ -142,7 +142,3 @@ def _label(block: Block, pixel: Callable[[Pair], Pair]) -> str:
 
 def _text(text: str, x: float, y: float) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" fill="#000000">{text}</text>'
-
-
-def _shown(block: Block) -> str:
-    return block.name.replace("_", ",")

@@ -93,7 +93,7 @@ def gridded(places: Float64, columns: int, rows: int) -> Tree:
 
 
 def cut_again(tree: Tree, names: Sequence[str], places: Float64) -> Tree:
-    """GroundCut each of the named cells in two, and number all cells anew. A cell whose places are all equal stays.
+    """Cut each of the named cells in two, and number all cells anew. A cell whose places are all equal stays.
 
     places: (P, 2), coordinates on the ground.
     """

@@ -25,7 +25,7 @@ class BlocksFinishVerb(Verb):
     city: CityFolder
     """Folder with the merged model (clsplat blocks merge)."""
     finish: OptionalInt = None
-    """Number of steps. If not given: those of the run that goes on, else those of the plan."""
+    """Number of steps. If not given: those of the existing run, or of the plan if there is no run."""
     progress: TrainingProgress = "auto"
     """How progress is written, as for clsplat blocks train."""
     device: Annotated[TrainingMachine, arg(name="")] = field(default_factory=TrainingMachine)
@@ -35,11 +35,14 @@ class BlocksFinishVerb(Verb):
 
 def run(verb: BlocksFinishVerb, services: Services) -> int:
     """Train the merged model, unless that has been done."""
-    from clsplat.blocks.block_training import finish
+    from clsplat.blocks.block_training import finish, is_finished
+    from clsplat.blocks.plan import read_plan
 
     verb.device.check()
-    train = trainer(services, verb.device, verb.progress)
-    if not finish(verb.city, verb.finish, loader(services), train, verb.device.count):
+    done = is_finished(verb.city, read_plan(verb.city), verb.finish)  # before the device is opened
+    if done or not finish(
+        verb.city, verb.finish, loader(services), trainer(services, verb.device, verb.progress), verb.device.count
+    ):
         print(f"{verb.city}: has been finished before", file=sys.stderr)
     tell_of_city(verb.city, as_json=verb.json)
     return 0

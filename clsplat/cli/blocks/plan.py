@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -90,6 +91,7 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     """Make the plan. Errors in the command line are reported before anything is written."""
     from clsplat.blocks.plan import PLAN_FILE
     from clsplat.blocks.plan_check import check_new_plan, kept_plan
+    from clsplat.blocks.planning.coarse import without_density_control
     from clsplat.blocks.planning.new_plan import coarse_run
 
     division, up = _checked(verb)
@@ -97,7 +99,7 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
     check_new_plan(city)
     coarse = coarse_run(city)
     scene, config = _scene(verb, services, coarse)
-    plan = kept_plan(city, scene, config, division, up)
+    plan = kept_plan(city, verb.scene, scene, config, division, up)
     if plan is None:
         try:
             coarse = _trained(verb, services, coarse, scene, config)
@@ -105,7 +107,7 @@ def run(verb: BlocksPlanVerb, services: Services) -> int:
         except KeyboardInterrupt as error:
             error.args = (f"before the plan in {city} was made; the same command goes on",)
             raise
-    for line in plan.joined:
+    for line in [*plan.joined, *without_density_control(config)]:
         warn(f"{city / PLAN_FILE}: {line}")
     _tell(city, plan)
     return 0
@@ -164,12 +166,14 @@ def _trained(verb: BlocksPlanVerb, services: Services, coarse: Run | None, scene
     training = verb.training(verb.output / COARSE_FOLDER, wanted.on_devices(verb.device.count, explicit=False))
     training = replace(training, passes=None)
     if coarse is None:
-        train.run(training, services)
+        with redirect_stdout(sys.stderr):  # standard output has the table of the plan
+            train.run(training, services)
         return Run.open(verb.output / COARSE_FOLDER)
     if check_coarse(coarse, wanted, scene, config):
         print(f"the coarse model in {coarse.path} is trained", file=sys.stderr)
         return coarse
-    train.run(replace(training, resume=True, config=coarse.config), services)
+    with redirect_stdout(sys.stderr):
+        train.run(replace(training, resume=True, config=coarse.config), services)
     return Run.open(coarse.path)
 
 

@@ -36,18 +36,20 @@ class BlocksTrainVerb(Verb):
 
 def run(verb: BlocksTrainVerb, services: Services) -> int:
     """Train the block, unless it has finished."""
-    from clsplat.blocks.block_training import train_block
+    from clsplat.blocks.block_training import is_trained, train_block
     from clsplat.blocks.plan import read_plan
 
     verb.device.check()
-    name = verb.block
+    plan, name = read_plan(verb.city), verb.block
     if name.isascii() and name.isdigit():
-        blocks = read_plan(verb.city).blocks
-        if int(name) >= len(blocks):
-            print(f"{verb.city}: the plan has {len(blocks)} blocks, so there is nothing to do", file=sys.stderr)
+        digits, count = name.lstrip("0") or "0", len(plan.blocks)
+        if len(digits) > len(str(count)) or int(digits) >= count:  # int() refuses thousands of digits
+            print(f"{verb.city}: the plan has {count} blocks, so there is nothing to do", file=sys.stderr)
             return 0
-        name = blocks[int(name)].name.replace("_", ",")
-    train = trainer(services, verb.device, verb.progress)
-    if not train_block(verb.city, name, loader(services), train, verb.device.count):
+        name = plan.blocks[int(digits)].shown
+    done = is_trained(verb.city, plan, plan.block(name))  # before the device is opened, as a queue may repeat a task
+    if done or not train_block(
+        verb.city, name, loader(services), trainer(services, verb.device, verb.progress), verb.device.count
+    ):
         print(f"{verb.city}: block {name} has finished before", file=sys.stderr)
     return 0

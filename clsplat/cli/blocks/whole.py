@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -38,10 +38,15 @@ def run(verb: TrainVerb, services: Services) -> int:
     _check(verb)
     city = verb.output
     if not verb.resume:
-        _plan(verb, services)
+        # with --json, standard output has the JSON alone
+        with redirect_stdout(sys.stderr) if verb.json else nullcontext():
+            _plan(verb, services)
     plan = read_plan(city)
-    if verb.scene is not None and verb.scene.absolute() != plan.scene:
-        raise InputError(f"{city}: its plan is of the scene {plan.scene}, not of {verb.scene}; expected a new folder")
+    if verb.scene is not None and verb.scene.resolve() != plan.scene.resolve():
+        raise InputError(
+            f"{city}: its plan is of the scene {plan.scene}, not of {verb.scene}; expected that scene or a new folder; "
+            "if the scene was moved, repeat the command that began the training, with the new path"
+        )
     if verb.blocks.workers is None and verb.blocks.scheduler is None:
         _one_after_another(verb, services, plan)
     else:
@@ -124,7 +129,7 @@ def _one_after_another(verb: TrainVerb, services: Services, plan: BlockPlan) -> 
     load, count = _loading_once(loader(services)), verb.device.count
     train = trainer(services, verb.device)
     for index, block in enumerate(plan.blocks, 1):
-        name = block.name.replace("_", ",")
+        name = block.shown
         with _advice(verb, f"in block {name}, {index} of {len(plan.blocks)}"):
             print(f"block {name}, {index} of {len(plan.blocks)}", file=sys.stderr)
             if not train_block(verb.output, name, load, train, count):
