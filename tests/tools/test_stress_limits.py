@@ -30,7 +30,7 @@ def rows(out: str) -> dict[str, list[str]]:
 def test_a_few_limits(capsys: Capture, default_device: Device) -> None:
     """`tools/stress/run limits` is the long form."""
     require("viser")
-    words = "killed,watched at"
+    words = "killed at,watched at"
     device = str(default_device.index)
     assert stress_limits.main([*SMALL, "--devices", device, "--only", words]) == 0
     found = rows(capsys.readouterr().out)
