@@ -78,7 +78,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
 def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devices: int = 1) -> bool:
     """Train the merged model on all photographs, and evaluate it. Returns False if that has been done before.
 
-    steps: number of steps; None for those of the existing run, or of the plan if there is no run.
+    steps: number of steps; None keeps the number of the existing run; without a run it takes the plan's.
     devices: number of devices of this machine that train it.
     Raises InputError if the blocks are not merged, if the plan does not fit the scene or the coarse model, or if
     another process writes the city's run.

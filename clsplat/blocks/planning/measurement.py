@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement of what photographs show and of the loads of cells: the coarse model is drawn for each photograph."""
+"""Measurement of the places that photographs show, and of the cells' loads, by rendering the coarse model."""
 
 from __future__ import annotations
 

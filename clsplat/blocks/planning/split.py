@@ -66,10 +66,7 @@ def balanced(places: Float64, count: int) -> Tree:
     The names of the cells are I_J: I is 0 for the cells below the first cut and 1 for those above, and J counts the
     cells on each side. There are fewer cells if too many places are equal.
     """
-    tree = _halved(places, count)
-    if isinstance(tree, Leaf):
-        return Leaf("0_0")
-    return replace(tree, below=_numbered(tree.below, 0), above=_numbered(tree.above, 1))
+    return _named(_halved(places, count))
 
 
 def gridded(places: Float64, columns: int, rows: int) -> Tree:
@@ -104,7 +101,11 @@ def cut_again(tree: Tree, names: Sequence[str], places: Float64) -> Tree:
         low = some[:, part.axis] < part.at
         return replace(part, below=cut(part.below, some[low]), above=cut(part.above, some[~low]))
 
-    tree = cut(tree, places)
+    return _named(cut(tree, places))
+
+
+def _named(tree: Tree) -> Tree:
+    """Name the cells by the sides of the first cut, as `balanced` does."""
     if isinstance(tree, Leaf):
         return Leaf("0_0")
     return replace(tree, below=_numbered(tree.below, 0), above=_numbered(tree.above, 1))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,11 +40,7 @@ def matched_pairs(
     orders = [[place[name] for name in sequence if name in place] for sequence in sequences]
     positions = sfm_database.gps_positions(database, ids)
     chosen = sfm_pairs.chosen_matching(matching, len(ids), orders, positions)
-
-    def alike(neighbours: int) -> list[Pair]:
-        rows = sfm_database.largest_descriptors(database, ids, sfm_pairs.RETRIEVAL_FEATURES)
-        return sfm_pairs.nearest_pairs(1 - sfm_pairs.image_similarity(rows, seed), neighbours)
-
+    alike = partial(_similar_pairs, database, ids, seed)
     if chosen == "exhaustive":
         pairs = sfm_pairs.all_pairs(len(ids))
     elif chosen == "sequential":
@@ -64,6 +61,15 @@ def matched_pairs(
     else:
         pairs = alike(sfm_pairs.ALIKE_NEIGHBOURS)
     return chosen, [(ids[one], ids[two]) for one, two in pairs]
+
+
+def _similar_pairs(database: Path, ids: Sequence[int], seed: int, neighbours: int) -> list[Pair]:
+    """Return the pairs of each photograph with the most similar others, by places in `ids`, the photographs' numbers.
+
+    seed: seed of the clustering. neighbours: number of others that a photograph is paired with.
+    """
+    rows = sfm_database.largest_descriptors(database, ids, sfm_pairs.RETRIEVAL_FEATURES)
+    return sfm_pairs.nearest_pairs(1 - sfm_pairs.image_similarity(rows, seed), neighbours)
 
 
 def overlapping_pairs(database: Path, pairs: Sequence[Pair]) -> list[Pair]:
@@ -91,8 +97,7 @@ def pairs_of_unconnected(database: Path, pairs: Sequence[Pair], seed: int) -> li
     lone = {ids[at] for at in sfm_pairs.unconnected(len(ids), [(place[one], place[two]) for one, two in verified])}
     if not lone:
         return []
-    rows = sfm_database.largest_descriptors(database, ids, sfm_pairs.RETRIEVAL_FEATURES)
-    found = sfm_pairs.nearest_pairs(1 - sfm_pairs.image_similarity(rows, seed), sfm_pairs.LOOP_NEIGHBOURS)
+    found = _similar_pairs(database, ids, seed, sfm_pairs.LOOP_NEIGHBOURS)
     alike = {(ids[one], ids[two]) for one, two in found}
     return sorted(pair for pair in alike.difference(pairs) if not lone.isdisjoint(pair))
 
