@@ -171,5 +171,5 @@ def _copy_refined(coarse: Run, run: Run) -> None:
     """Copy the refined cameras of the coarse model, with which `run` was trained, so that its users find them."""
     if coarse.config.refines:
         run.refined_path.mkdir(exist_ok=True)
-        for path in sorted(coarse.refined_path.glob("*.txt")):
+        for path in sorted(coarse.refined_path.iterdir()):  # the cameras, and their place on the earth if it is known
             atomic_write(run.refined_path / path.name, path.read_bytes())

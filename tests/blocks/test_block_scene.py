@@ -18,6 +18,7 @@ from clsplat.device.context import Device
 from clsplat.runs.refined_lenses import through_refined
 from clsplat.runs.run import Run
 from clsplat.runs.scene_record import read
+from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, Georeference, read_georeference
 from clsplat.scenes.loading import load_scene_of
 from clsplat.scenes.readers.colmap import read_cameras
 
@@ -36,6 +37,7 @@ def refined(tmp_path_factory: pytest.TempPathFactory, small_scene: Path, default
     """A city whose coarse model has refined cameras and learnt exposures."""
     city = tmp_path_factory.mktemp("refined") / "city"
     write_city(city, small_scene, default_device, SETTINGS)
+    (city / "coarse" / "refined" / GEOREFERENCE_FILE).write_bytes(Georeference(32632).content())
     for name in ("0,0", "1,0"):
         assert train_block(city, name, load(), trains_on(default_device))
     assert merge(city)
@@ -100,3 +102,11 @@ def test_a_city_without_the_learnt_appearance_is_refused(refined: Path, tmp_path
     assert (
         "coarse/appearance.json: no such file, expected a finished run of clsplat train --appearance exposure" in said
     )
+
+
+def test_the_city_has_the_refined_cameras_and_their_place(refined: Path) -> None:
+    names = {"cameras.txt", "images.txt", "points3D.txt", GEOREFERENCE_FILE}
+    assert {path.name for path in (refined / "refined").iterdir()} == names
+    place = read_georeference(refined / "refined" / GEOREFERENCE_FILE)
+    assert place is not None
+    assert place.epsg == 32632
