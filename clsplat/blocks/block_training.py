@@ -14,7 +14,7 @@ from pathlib import Path
 
 from clsplat.blocks.block_scene import scene_of_block, scene_of_finish
 from clsplat.blocks.block_settings import block_settings, finish_settings
-from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of, region_of_cell
+from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of, region_of_block
 from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, Block, BlockPlan, read_plan
 from clsplat.blocks.plan_check import check_plan
 from clsplat.blocks.progress_records import (
@@ -64,7 +64,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         coarse = Run.open(city / COARSE_FOLDER)
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene, photographs=block.photographs)
-        part, region = scene_of_block(scene, plan, block, coarse), region_of_cell(plan, block.widened)
+        part, region = scene_of_block(scene, plan, block, coarse), region_of_block(plan, block, widened=True)
         model = first_model_of_block(coarse.model_path, region, part, plan.settings)
         surroundings = len(model) - block.gaussians
         config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)

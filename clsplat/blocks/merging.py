@@ -10,13 +10,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.plan import BLOCKS_FOLDER, BlockPlan, Rectangle, read_plan
+from clsplat.blocks.plan import BLOCKS_FOLDER, Block, BlockPlan, read_plan
 from clsplat.blocks.progress_records import MERGED_FILE, done_record
 from clsplat.errors import ClsplatError, InputError, examples
 from clsplat.files.documents import digest, open_input
@@ -43,9 +43,15 @@ class CellModel:
             yield take(some, self.cell.contains(some.means, some.origin))
 
 
-def region_of_cell(plan: BlockPlan, rectangle: Rectangle) -> TrainedRegion:
-    """Return a cell of the plan, or a widened cell, as a region of the world."""
-    return TrainedRegion(np.array(plan.axes), np.array(rectangle.low), np.array(rectangle.high))
+def region_of_block(plan: BlockPlan, block: Block, *, widened: bool = False) -> TrainedRegion:
+    """Return the cell of a block, or its widened cell, as a region of the world: the part of it without the sky. The
+    block of the sky has the rest."""
+    rectangle = block.widened if widened else block.cell
+    region = TrainedRegion(np.array(plan.axes), np.array(rectangle.low), np.array(rectangle.high))
+    if plan.sky is None:
+        return region
+    sphere = replace(region, centre=np.array(plan.sky.centre))
+    return replace(sphere, nearest=plan.sky.radius) if block.is_sky else replace(sphere, farthest=plan.sky.radius)
 
 
 def write_merged(target: Path, models: Sequence[CellModel], comments: Sequence[str] = ()) -> int:
@@ -102,7 +108,7 @@ def merge(city: Path) -> bool:
                 f"{path}: is not the model that the block's training wrote; put it back, or remove "
                 f"{path.with_name('done.json')} and train the block again"
             )
-        models.append(CellModel(path, region_of_cell(plan, block.cell)))
+        models.append(CellModel(path, region_of_block(plan, block)))
     write_merged(target, models, [comment(recorded_space(models[0].path)), f"{MERGED_COMMENT} {wanted}"])
     return True
 

@@ -28,9 +28,11 @@ PLAN_FORM = 1
 """Form of plan.json that this version writes, and the only one that it reads."""
 MARGIN = 0.2
 """Width that widens a cell on each side, as a fraction of the cell's size along the same axis."""
-SHARE = 0.25
+SHARE = 0.3
 """A photograph belongs to a cell's block if the cell fills at least this fraction of the pixels that the photograph's
 fullest cell fills (docs/scale.md)."""
+SKY_BLOCK = "sky"
+"""Name of the block of the sky."""
 _EXPECTED_PLAN = "a plan that clsplat blocks plan wrote"
 Pair = tuple[float, float]
 Point = tuple[float, float, float]
@@ -52,12 +54,13 @@ class Rectangle:
 class Block:
     """A part of the scene that is trained on its own.
 
-    name: two numbers, such as "0_1", which are also the name of the block's folder.
-    cell: the block's part of the ground. The cells of all blocks cover the plane without overlap.
+    name: two numbers, such as "0_1", or "sky". It is also the name of the block's folder.
+    cell: the block's part of the ground. The cells of all blocks cover the plane without overlap. The cell of the sky
+        is the whole plane.
     widened: the cell and its margin, within which the block's Gaussians are trained.
     photographs: names of the training views that belong to the block, sorted.
     iterations: number of training steps.
-    gaussians: number of the coarse model's Gaussians in the widened cell.
+    gaussians: number of the coarse model's Gaussians in the widened cell, without the sky; or in the sky.
     """
 
     name: str
@@ -71,6 +74,23 @@ class Block:
     def shown(self) -> str:
         """The name as commands and messages write it, such as "0,1"."""
         return shown_name(self.name)
+
+    @property
+    def is_sky(self) -> bool:
+        """True for the block of the sky."""
+        return self.name == SKY_BLOCK
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A sphere around the scene. The Gaussians outside it, which photographs from all blocks show, are the sky.
+
+    centre: in world coordinates.
+    radius: in world units.
+    """
+
+    centre: Point
+    radius: float
 
 
 @dataclass(frozen=True)
@@ -102,6 +122,7 @@ class BlockPlan:
     extent: the whole scene's extent in world units (`Scene.extent`).
     finish_steps: number of steps over all photographs after the merge.
     blocks: in the order in which the merge joins them.
+    sky: where the sky begins, if it is a block of its own; None if it is divided into the cells like the ground.
     joined: in words, for each cell that was joined to its neighbours, the reason, and what a single block lacks.
     photographs: number of the scene's training views.
     gaussians: number of the coarse model's Gaussians.
@@ -118,6 +139,7 @@ class BlockPlan:
     extent: float
     finish_steps: int
     blocks: tuple[Block, ...]
+    sky: Sky | None = None
     joined: tuple[str, ...] = ()
     photographs: int = 0
     gaussians: int = 0
@@ -127,6 +149,11 @@ class BlockPlan:
         """SHA-256 of the plan without the scene's path, in hexadecimal. It does not depend on clsplat's version."""
         document = {key: value for key, value in self.document().items() if key not in ("clsplat", "scene")}
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def cells(self) -> list[Block]:
+        """The blocks of the ground, without the sky."""
+        return [block for block in self.blocks if not block.is_sky]
 
     def block(self, name: str) -> Block:
         """Return the block with a name such as "0_1" or "0,1". Raises InputError if the plan has no such block."""
@@ -155,6 +182,7 @@ class BlockPlan:
             "margin": self.margin,
             "share": self.share,
             "finish_steps": self.finish_steps,
+            "sky": None if self.sky is None else {"centre": list(self.sky.centre), "radius": self.sky.radius},
             "joined": list(self.joined),
             "photographs": self.photographs,
             "gaussians": self.gaussians,
@@ -217,6 +245,7 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
         extent=_number(document["extent"]),
         finish_steps=_count(document["finish_steps"]),
         blocks=tuple(_block_of(block) for block in document["blocks"]),
+        sky=_sky_of(document["sky"]),
         joined=tuple(_text(line) for line in document["joined"]),
         photographs=_count(document["photographs"]),
         gaussians=_count(document["gaussians"]),
@@ -224,13 +253,24 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
     names = [block.name for block in plan.blocks]
     if not names or len(set(names)) < len(names):
         raise ValueError("expected blocks, each with a name of its own")
+    if (SKY_BLOCK in names) != (plan.sky is not None):
+        raise ValueError("expected a block of the sky if it is said where the sky begins, and none otherwise")
     return plan
+
+
+def _sky_of(sky: Mapping[str, Any] | None) -> Sky | None:
+    if sky is None:
+        return None
+    if (radius := _number(sky["radius"])) <= 0:
+        raise ValueError(f"the sky begins at the distance {radius}, expected more than 0")
+    return Sky(_point(sky["centre"]), radius)
 
 
 def _block_of(block: Mapping[str, Any]) -> Block:
     name = _text(block["name"])
-    if [part.isascii() and part.isdigit() for part in name.split("_")] != [True, True]:  # it is the name of a folder
-        raise ValueError(f"a block has the name {name!r:.40}, expected two numbers such as 0_1")
+    digits = [part.isascii() and part.isdigit() for part in name.split("_")]
+    if name != SKY_BLOCK and digits != [True, True]:  # it is the name of a folder
+        raise ValueError(f"a block has the name {name!r:.40}, expected two numbers such as 0_1, or sky")
     return Block(
         name=name,
         cell=_rectangle(block["cell"]),

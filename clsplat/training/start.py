@@ -77,7 +77,16 @@ def region_state(region: TrainedRegion | None) -> dict[str, Any]:
     if region is None:
         return {}
     edges = [[None if np.isinf(edge) else edge for edge in side.tolist()] for side in (region.low, region.high)]
-    return {"region": {"axes": region.axes.tolist(), "low": edges[0], "high": edges[1]}}
+    return {
+        "region": {
+            "axes": region.axes.tolist(),
+            "low": edges[0],
+            "high": edges[1],
+            "centre": region.centre.tolist(),
+            "nearest": region.nearest,
+            "farthest": None if np.isinf(region.farthest) else region.farthest,
+        }
+    }
 
 
 def region_of(state: Mapping[str, Any] | None) -> TrainedRegion | None:
@@ -87,7 +96,9 @@ def region_of(state: Mapping[str, Any] | None) -> TrainedRegion | None:
     low, high = (
         [end if edge is None else edge for edge in state[side]] for side, end in (("low", -inf), ("high", inf))
     )
-    return TrainedRegion(np.array(state["axes"]), np.array(low), np.array(high))
+    farthest = inf if state["farthest"] is None else state["farthest"]
+    centre = np.array(state["centre"])
+    return TrainedRegion(np.array(state["axes"]), np.array(low), np.array(high), centre, state["nearest"], farthest)
 
 
 def check_region(checkpoint: Checkpoint, region: TrainedRegion | None) -> None:

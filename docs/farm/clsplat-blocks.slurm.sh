@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 # Submits a large scene in blocks to Slurm: the plan, an array with a job for each block, the merge and the finish.
 #
-#     BLOCKS=2x2 COUNT=4 sh clsplat-blocks.slurm.sh /shared/scene /shared/city [settings of clsplat blocks plan]
+#     BLOCKS=2x2 COUNT=5 sh clsplat-blocks.slurm.sh /shared/scene /shared/city [settings of clsplat blocks plan]
 #
-# COUNT is the number of blocks; jobs of the array without a block end at once. Both folders must have the same paths on
+# COUNT is the number of blocks, and one more for the sky; jobs of the array without a block end at once. Both folders must have the same paths on
 # all nodes. SBATCH has further options of sbatch, such as "--gres=gpu:1 --time=8:00:00". What was interrupted goes on
 # when this script is run again. CLSPLAT names the command, if it is not clsplat.
 set -eu
@@ -13,7 +13,7 @@ scene=$(realpath "$1")
 city=$(realpath "$2")
 shift 2
 BLOCKS=${BLOCKS:-2x2}
-COUNT=${COUNT:-4}
+COUNT=${COUNT:-5}
 CLSPLAT=${CLSPLAT:-clsplat}
 mkdir -p "$city/jobs"
 

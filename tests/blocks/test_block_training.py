@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from small_city import BLOCK_STEPS, FINISH_STEPS, WHOLE, in_cell, load, trains_o
 
 from clsplat.blocks.block_training import finish, is_finished, train_block
 from clsplat.blocks.merging import is_merged, merge
-from clsplat.blocks.plan import read_plan
+from clsplat.blocks.plan import SKY_BLOCK, Block, Rectangle, Sky, read_plan, write_plan
 from clsplat.blocks.tasks import tasks_of
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
@@ -56,6 +58,26 @@ def test_the_merge_has_each_cell_from_its_block(done_city: Path) -> None:
         model = Gaussians.load(done_city / "blocks" / block.name / "model.ply")
         parts.append(model.means[in_cell(model, block.cell)])
     assert_same_bits(Gaussians.load(done_city / "merged.ply").means, np.concatenate(parts))
+
+
+def test_the_sky_is_a_block_of_its_own(city: Path, default_device: Device) -> None:
+    plan, coarse = read_plan(city), Gaussians.load(city / "coarse" / "model.ply")
+    distances = np.linalg.norm(coarse.means, axis=1)
+    radius = float(np.median(distances))
+    photographs = tuple(sorted({name for block in plan.blocks for name in block.photographs}))
+    everywhere = Rectangle((-inf, -inf), (inf, inf))
+    sky = Block(SKY_BLOCK, everywhere, everywhere, photographs, BLOCK_STEPS, int((distances >= radius).sum()))
+    write_plan(city, replace(plan, sky=Sky((0.0, 0.0, 0.0), radius), blocks=(*plan.blocks, sky)))
+    parts = []
+    for block in read_plan(city).blocks:
+        assert train_block(city, block.shown, load(), trains_on(default_device))
+        model = Gaussians.load(city / "blocks" / block.name / "model.ply")
+        far = np.linalg.norm(model.means, axis=1) >= radius
+        assert len(model)
+        assert far.all() if block.is_sky else not far.any()
+        parts.append(model.means[in_cell(model, block.cell)])
+    assert merge(city)
+    assert_same_bits(Gaussians.load(city / "merged.ply").means, np.concatenate(parts))
 
 
 def test_the_city_is_a_run(done_city: Path) -> None:

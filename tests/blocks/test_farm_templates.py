@@ -112,7 +112,7 @@ def test_what_kubernetes_runs() -> None:
         names.append(type(parse(words[1:])).__name__)
     assert names == ["BlocksPlanVerb", "BlocksTrainVerb", "BlocksMergeVerb", "BlocksFinishVerb"]
     assert jobs[1]["spec"]["completionMode"] == "Indexed"
-    assert "--blocks, 2x2" in KUBERNETES.read_text() and jobs[1]["spec"]["completions"] == 4
+    assert "--blocks, 2x2" in KUBERNETES.read_text() and jobs[1]["spec"]["completions"] == 5
 
 
 def test_a_block_of_kubernetes_is_repeated() -> None:

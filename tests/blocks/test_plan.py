@@ -16,7 +16,7 @@ from small_city import WHOLE
 
 from clsplat.blocks import plan as plans
 from clsplat.blocks import plan_check
-from clsplat.blocks.plan import PLAN_FILE, Block, BlockPlan, Partition, Rectangle, read_plan, write_plan
+from clsplat.blocks.plan import PLAN_FILE, Block, BlockPlan, Partition, Rectangle, Sky, read_plan, write_plan
 from clsplat.blocks.plan_check import check_coarse, check_plan, kept_plan
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
@@ -42,9 +42,16 @@ PLAN = BlockPlan(
 )
 
 
-def test_a_plan_is_read_as_it_was_written(tmp_path: Path) -> None:
-    write_plan(tmp_path, PLAN)
-    assert read_plan(tmp_path) == PLAN
+PLANE = Rectangle((-inf, -inf), (inf, inf))
+WITH_SKY = replace(
+    PLAN, blocks=(*PLAN.blocks, Block("sky", PLANE, PLANE, ("a.jpg",), 9, 70)), sky=Sky((0.5, -1.0, 2.0), 600.5)
+)
+
+
+@pytest.mark.parametrize("plan", [PLAN, WITH_SKY], ids=["ground", "sky"])
+def test_a_plan_is_read_as_it_was_written(plan: BlockPlan, tmp_path: Path) -> None:
+    write_plan(tmp_path, plan)
+    assert read_plan(tmp_path) == plan
     document = json.loads((tmp_path / PLAN_FILE).read_text("utf-8"))
     assert document["blocks"][0]["cell"] == {"low": [None, None], "high": [0.30000000000000004, None]}
 
@@ -60,6 +67,8 @@ def test_the_digest_does_not_depend_on_the_scenes_path_or_the_version(monkeypatc
 
 def test_a_block_is_found_by_its_name() -> None:
     assert PLAN.block("1,0") is PLAN.block("1_0") is PLAN.blocks[1]
+    assert WITH_SKY.block("sky") is WITH_SKY.blocks[2]
+    assert WITH_SKY.cells == list(PLAN.blocks)
     with pytest.raises(InputError, match="--block 3,0: the plan has no such block, expected one of 0,0, 1,0"):
         PLAN.block("3,0")
 
@@ -95,6 +104,9 @@ def test_a_missing_plan_says_how_to_make_it(tmp_path: Path) -> None:
         (lambda plan: plan["train"].update(seed="x"), "train.seed is 'x', expected a whole number"),
         (lambda plan: plan["train"].update(sed=1), "'sed', which is not a setting"),
         (lambda plan: plan.update(joined=None), "is damaged"),
+        (lambda plan: plan.update(sky={"centre": [0, 0, 0], "radius": 0}), "the sky begins at the distance 0.0"),
+        (lambda plan: plan.update(sky={"centre": [0, 0, 0], "radius": 3}), "expected a block of the sky if"),
+        (lambda plan: plan["blocks"][0].update(name="sky"), "expected a block of the sky if"),
     ],
 )
 def test_damage_is_named(change: Callable[[dict[str, Any]], object], why: str, tmp_path: Path) -> None:

@@ -13,12 +13,15 @@ from calls import warned
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.blocks.plan import Partition
+from clsplat.blocks.plan import Partition, Sky
+from clsplat.blocks.planning.coarse import sky_steps
 from clsplat.blocks.planning.measurement import LoadMeasurement
 from clsplat.blocks.planning.new_plan import divided
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 
 STREET_METRES = 100
+SKY = Sky((0.0, 0.0, 0.0), 1e3)
 
 
 class GivenLoads(LoadMeasurement):
@@ -32,6 +35,8 @@ class GivenLoads(LoadMeasurement):
         self.along, self.reach, self.passes, self.coarse = np.asarray(gaussians, float), reach, 0, 0
         self.__dict__["camera_places"] = on_street(cameras)
         self.__dict__["coordinates"] = on_street(gaussians)
+        self.__dict__["_sky_rows"] = np.zeros(len(self.along), np.bool_)
+        self.model = cast("Any", self.along)
 
     def bytes_needed(self, gaussians: float) -> int:
         return round(self.coarse + 10 * gaussians)
@@ -152,6 +157,49 @@ def test_no_more_cells_are_joined_than_needed() -> None:
     assert len(loads.names) == 3
     assert "1_1" in loads.names
     assert loads.belongs.sum(axis=0).tolist()[-1] == 4
+
+
+def under_the_sky(photographs: int) -> GivenLoads:
+    """The street, and ten Gaussians above its end that the first photographs also show."""
+
+    class WithSky(GivenLoads):
+        def _contributions(self, text: str) -> Iterator[Float32]:
+            for index, weights in enumerate(super()._contributions(text)):
+                weights[-10:] = index < photographs
+                yield weights
+
+    along = np.append(np.arange(0, STREET_METRES, 0.5), np.full(10, 1e4))
+    measured = WithSky(np.arange(0, STREET_METRES, 2), along, 5.0)
+    measured.__dict__["_sky_rows"] = along > 1e3
+    measured.__dict__["_sphere"] = SKY
+    return measured
+
+
+def test_the_sky_is_in_no_cell() -> None:
+    loads, notes = divided(under_the_sky(30), Partition("2"))
+    ground, _ = divided(street(), Partition("2"))
+    assert notes == [] and loads.sky is not None
+    assert loads.sky.sphere is SKY
+    assert np.flatnonzero(loads.sky.shown).tolist() == list(range(30))
+    assert loads.inside.tolist() == ground.inside.tolist()
+    assert loads.cells == ground.cells
+    assert (loads.belongs == ground.belongs).all()
+
+
+def test_a_sky_of_one_place_or_one_block_stays_in_the_cells() -> None:
+    loads, _ = divided(under_the_sky(1), Partition("2"))
+    assert loads.sky is None
+    assert loads.inside.sum() == STREET_METRES / 0.5 + 10
+    loads, _ = divided(under_the_sky(30), Partition("1"))
+    assert loads.sky is None
+    assert loads.inside.sum() == STREET_METRES / 0.5 + 10
+
+
+def test_the_sky_takes_no_longer_than_a_block() -> None:
+    config = TrainConfig(iterations=30_000)
+    assert sky_steps(config, 200, 1000, 5000) == round(0.25 * 200 * 25_500 / 1000)
+    assert sky_steps(config, 1000, 1000, 5000) == 5000
+    assert sky_steps(config, 1, 10**6, 5000) == 1
 
 
 def test_a_scene_that_cannot_be_trained_is_refused() -> None:

@@ -34,7 +34,7 @@ from clsplat.stages import region as region_stage
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.repro_bundle import read_bundle, replay, write_bundle
 from clsplat.training.stability.health import Incident
-from clsplat.training.start import Start
+from clsplat.training.start import Start, region_of, region_state
 from clsplat.training.step import visible_chunks
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
@@ -43,6 +43,10 @@ GROUND = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 REGION = TrainedRegion(GROUND, np.array([-0.1, -np.inf]), np.array([np.inf, 0.6]))
 """Region with 24 of the 40 Gaussians of `start_model`."""
 EVERYWHERE = TrainedRegion(GROUND, np.full(2, -np.inf), np.full(2, np.inf))
+CENTRE = np.array([0.1, -0.05, 0.2])
+"""Centre of the regions with limits of distance, at which half of those Gaussians are nearer than 0.55."""
+NEAR = replace(REGION, centre=CENTRE, farthest=0.55)
+FAR = replace(EVERYWHERE, centre=CENTRE, nearest=0.55)
 NAMES = [name for name, config in SETTINGS.items() if not config.refines]
 
 
@@ -115,6 +119,27 @@ def test_edges_are_half_open() -> None:
     assert EVERYWHERE.contains(huge).tolist() == [False, True], "infinity times the axis' 0 is no number"
 
 
+def test_a_sphere_divides_each_cell_in_two() -> None:
+    """Also at distances that are exactly the radius, and beyond float32's squares."""
+    rng, origin = np.random.default_rng(2), np.array([4.5e5, -12.0, 5.4e6])
+    means = rng.normal(0, 50, (2000, 3)).astype(np.float32)
+    means[:3] = [[3e38, 0, 0], [0, 1e25, 0], [np.nan, 0, 0]]
+    centre = origin + rng.normal(0, 20, 3)
+    squares = replace(EVERYWHERE, centre=centre).relative_to(origin).squares(means)
+    for radius in (*np.sqrt(squares[5:9].astype(np.float64)), 40.0, 1e-3):
+        cell = TrainedRegion(GROUND, origin[[0, 2]], np.full(2, np.inf), centre)
+        parts = replace(cell, farthest=radius), replace(cell, nearest=radius)
+        inside, outside = (part.contains(means, origin) for part in parts)
+        assert not (inside & outside).any()
+        assert ((inside | outside) == cell.contains(means, origin)).all()
+    found = replace(EVERYWHERE, nearest=5.0).contains(np.array([[3, 4, 0], [3, 3.9, 0], [3e38, 1, 1]], np.float32))
+    assert found.tolist() == [True, False, True]
+    assert replace(EVERYWHERE, farthest=5.0).contains(np.array([[3, 4, 0], [3, 3.9, 0]], np.float32)).tolist() == [
+        False,
+        True,
+    ]
+
+
 def test_far_from_the_origin_of_the_world() -> None:
     """A region of 0.1 at 5,000 km, where float32 numbers are 0.5 apart."""
     origin = np.array([5e6, 0.0, 5e6])
@@ -142,6 +167,13 @@ def test_rows_inside_are_found_piece_by_piece(
         ({"low": [0, np.nan]}, r"region: low is \[0, nan\], expected \(2,\) numbers"),
         ({"high": "wide"}, r"region: high is 'wide', expected \(2,\) numbers"),
         ({"low": [1, 0]}, r"region: low is \[1.0, 0.0\] and high \[1.0, 1.0\], expected low < high"),
+        ({"centre": np.array([0, 0, np.inf])}, r"region: centre is array\(.*, expected \(3,\) numbers"),
+        (
+            {"nearest": 2.0, "farthest": 2.0},
+            "region: nearest is 2.0 and farthest 2.0, expected 0 <= nearest < farthest",
+        ),
+        ({"nearest": -1.0}, "region: nearest is -1.0"),
+        ({"farthest": np.nan}, "region: nearest is 0.0 and farthest nan"),
     ],
 )
 def test_a_wrong_region(changes: dict[str, Any], message: str) -> None:
@@ -150,6 +182,22 @@ def test_a_wrong_region(changes: dict[str, Any], message: str) -> None:
 
 
 # Trainings
+
+
+@pytest.mark.parametrize("region", [NEAR, FAR], ids=["near", "far"])
+def test_gaussians_beyond_a_distance_keep_every_byte(
+    region: TrainedRegion, folder: Path, default_device: Device
+) -> None:
+    config, model = SETTINGS["MCMC"], start_model()
+    given = rows_of(outside(model, region))
+    assert 5 < len(given) < 35
+    trainer = to_end(scene_for(folder, config), config, default_device, Start(model, region))
+    after = rows_of(trainer.gaussians())
+    assert set(given) <= set(after)
+    assert not set(after) & set(rows_of(take(model, region.contains(model.means))))
+    again = region_of(region_state(region)["region"])
+    assert again is not None
+    assert again.numbers == region.numbers
 
 
 @pytest.mark.parametrize("lanes", quick([8, 1], 8))

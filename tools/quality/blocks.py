@@ -17,7 +17,7 @@ from quality.trainings import Rows, call, trained, words_of
 from clsplat.arrays import Float32, Float64
 from clsplat.blocks import block_training
 from clsplat.blocks.block_settings import block_settings
-from clsplat.blocks.merging import region_of_cell
+from clsplat.blocks.merging import region_of_block
 from clsplat.blocks.plan import Block, BlockPlan, read_plan
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
@@ -64,7 +64,7 @@ class Border:
 def borders_of(plan: BlockPlan) -> list[Border]:
     """Find the lines between the blocks of a plan."""
     found = []
-    for block in plan.blocks:
+    for block in plan.cells:
         for axis, other in ((0, 1), (1, 0)):
             if np.isfinite(at := block.cell.high[axis]):
                 found.append(Border(axis, at, block.cell.low[other], block.cell.high[other]))
@@ -279,7 +279,7 @@ def standing(model: Gaussians, scene: Scene, plan: BlockPlan) -> Gaussians:
     """Gaussians over the first block's cell, up to TALLEST above the median point."""
     up = np.array(plan.up)
     heights = (model.means + model.origin) @ up - np.median(scene.points @ up)
-    inside = region_of_cell(plan, plan.blocks[0].cell).contains(model.means, model.origin)
+    inside = region_of_block(plan, plan.blocks[0]).contains(model.means, model.origin)
     return take(model, inside & (heights < TALLEST))
 
 

@@ -15,6 +15,9 @@ COARSE_SIZE = 0.5
 """Size of the photographs from which the coarse model is trained, as a fraction of their size in the whole."""
 MIN_DENSIFICATIONS = 8
 """Least number of densifications of the coarse model, if its schedule has as many steps between start and stop."""
+SKY_PASSES_SHARE = 0.25
+"""Passes of the sky's block through its photographs, as a fraction of the passes of the other blocks. More passes gain
+less than 0.05 dB (docs/scale.md)."""
 FINISH_STEPS_SHARE = 0.05
 """Steps over all photographs after the merge, as a fraction of the steps of the whole."""
 
@@ -75,6 +78,14 @@ def block_steps(config: TrainConfig, photographs: int, of: int) -> int:
     of: number of the scene's training photographs.
     """
     return max(round(photographs * (config.iterations - coarse_steps(config)) / of), 1)
+
+
+def sky_steps(config: TrainConfig, photographs: int, of: int, most: int) -> int:
+    """Number of steps of the sky's block. config, photographs, of: as for `block_steps`.
+
+    most: limit, so that the sky of a scene in many blocks takes no longer than one of them.
+    """
+    return max(min(round(SKY_PASSES_SHARE * block_steps(config, photographs, of)), most), 1)
 
 
 def finish_steps(config: TrainConfig) -> int:

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from clsplat.arrays import Bool, Float32, Float64
-from clsplat.blocks.plan import MARGIN, SHARE, Rectangle
+from clsplat.blocks.plan import MARGIN, SHARE, Rectangle, Sky
 from clsplat.blocks.planning.ground import Ground, on_ground
 from clsplat.blocks.planning.loads import CellBins, belonging, places_seen
-from clsplat.blocks.planning.split import Tree, bounds_of, cells, widened
+from clsplat.blocks.planning.split import Leaf, Tree, bounds_of, cells, widened
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
@@ -29,6 +29,26 @@ ROWS_GROWTH = 4.0
 size have four times as many pixels."""
 
 
+SKY_EXTENTS = 5.0
+"""Distance from the middle of the cameras at which the sky begins, in extents of the scene. `--sky` places Gaussians at
+SKY_RADIUS_RATIO (`config.points`) extents or more, from where they move while they are trained."""
+MIN_SKY_SHARE = 0.05
+"""A photograph shows the sky if the sky fills at least this fraction of the pixels that all Gaussians fill."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkyLoads:
+    """The part of the coarse model that is the sky, and the photographs that show it.
+
+    rows: (N,), True for the coarse model's Gaussians in the sky.
+    shown: (P,), True for photographs that show it.
+    """
+
+    sphere: Sky
+    rows: Bool
+    shown: Bool
+
+
 @dataclass(frozen=True, eq=False)
 class CellLoads:
     """Loads of the cells of a tree.
@@ -37,6 +57,7 @@ class CellLoads:
     widened: each cell with its margin.
     belongs: (P, B), True if a photograph belongs to a cell.
     inside, around: (B,), numbers of the coarse model's Gaussians in each cell, and in each widened cell.
+    sky: the sky, which the cells do not contain; None if they do.
     """
 
     names: tuple[str, ...]
@@ -45,6 +66,7 @@ class CellLoads:
     belongs: Bool
     inside: Float64
     around: Float64
+    sky: SkyLoads | None = None
 
 
 class LoadMeasurement:
@@ -81,10 +103,43 @@ class LoadMeasurement:
         return on_ground(np.stack([camera.position for camera in self.cameras]), self.ground.axes)
 
     @cached_property
+    def _shown(self) -> tuple[Float64, Float64]:
+        """Places (P, 2), as `places`, and the fraction (P,) of each photograph's pixels that the sky fills."""
+        rows, shares = self._sky_rows, list[float]()
+
+        def on_the_ground() -> Iterator[Float32]:
+            for weights in self._contributions("finding what photographs show"):
+                shares.append(float(weights[rows].sum(dtype=np.float64) / max(weights.sum(dtype=np.float64), 1e-30)))
+                yield np.where(rows, np.float32(0), weights)
+
+        places = places_seen(self.coordinates, on_the_ground(), self.camera_places)
+        return places, np.array(shares)
+
+    @cached_property
+    def _sphere(self) -> Sky:
+        """Where the sky begins, if there is one."""
+        x, y, z = (float(value) for value in self.scene.spread[0])
+        return Sky((x, y, z), SKY_EXTENTS * self.scene.extent)
+
+    @cached_property
+    def _sky_rows(self) -> Bool:
+        """Mask (N,) of the coarse model's Gaussians outside the sphere."""
+        offsets = self.model.means.astype(np.float64) + (self.model.origin - np.array(self._sphere.centre))
+        return np.asarray(np.linalg.norm(offsets, axis=1) >= self._sphere.radius)
+
+    @cached_property
     def places(self) -> Float64:
-        """Place (P, 2) that each photograph shows; the camera's place for a photograph that shows no Gaussian."""
-        contributions = self._contributions("finding what photographs show")
-        return places_seen(self.coordinates, contributions, self.camera_places)
+        """Place (P, 2) that each photograph shows, not counting the sky; the camera's place for a photograph that shows
+        no Gaussian on the ground."""
+        return self._shown[0]
+
+    @property
+    def sky(self) -> SkyLoads | None:
+        """The sky; None if photographs from fewer than two places show it."""
+        shown = self._shown[1] >= MIN_SKY_SHARE
+        if len(np.unique(self.camera_places[shown], axis=0)) < 2:
+            return None
+        return SkyLoads(self._sphere, self._sky_rows, shown)
 
     def of(self, tree: Tree) -> CellLoads:
         """Measure the loads of the cells of a tree. The loads of the last tree are remembered."""
@@ -92,10 +147,13 @@ class LoadMeasurement:
             names, rectangles = zip(*cells(tree), strict=True)
             bounds = bounds_of(self.places)
             wide = tuple(widened(cell, bounds, MARGIN) for cell in rectangles)
-            bins = CellBins.of(self.coordinates, rectangles)
-            filled = np.stack([bins.sums(weights) for weights in self._contributions("measuring loads of blocks")])
-            around = CellBins.of(self.coordinates, wide).sums()
-            self._last = tree, CellLoads(names, rectangles, wide, belonging(filled, SHARE), bins.sums(), around)
+            sky = None if isinstance(tree, Leaf) else self.sky
+            ground = np.ones(len(self.model), np.bool_) if sky is None else ~sky.rows
+            coordinates, contributions = self.coordinates[ground], self._contributions("measuring loads of blocks")
+            bins = CellBins.of(coordinates, rectangles)
+            filled = np.stack([bins.sums(weights[ground]) for weights in contributions])
+            around = CellBins.of(coordinates, wide).sums()
+            self._last = tree, CellLoads(names, rectangles, wide, belonging(filled, SHARE), bins.sums(), around, sky)
         return self._last[1]
 
     def bytes_needed(self, gaussians: float) -> int:

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, Block, BlockPlan, Partition, shown_name
-from clsplat.blocks.planning.coarse import block_steps, finish_steps
+from clsplat.blocks.plan import COARSE_FOLDER, MARGIN, SHARE, SKY_BLOCK, Block, BlockPlan, Partition, shown_name
+from clsplat.blocks.planning.coarse import block_steps, finish_steps, sky_steps
 from clsplat.blocks.planning.measurement import CellLoads, LoadMeasurement
 from clsplat.blocks.planning.split import (
     MAX_BLOCKS,
+    PLANE,
     Leaf,
     Tree,
     balanced,
@@ -53,6 +54,10 @@ def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division:
         own = tuple(photographs[photograph] for photograph in np.flatnonzero(loads.belongs[:, index]))
         steps, gaussians = block_steps(config, len(own), len(photographs)), round(float(loads.around[index]))
         blocks.append(Block(name, loads.cells[index], loads.widened[index], own, steps, gaussians))
+    if loads.sky is not None:
+        own = tuple(photographs[photograph] for photograph in np.flatnonzero(loads.sky.shown))
+        steps = sky_steps(config, len(own), len(photographs), max(block.iterations for block in blocks))
+        blocks.append(Block(SKY_BLOCK, PLANE, PLANE, own, steps, int(loads.sky.rows.sum())))
     return BlockPlan(
         scene=source.absolute(),
         settings=config,
@@ -65,6 +70,7 @@ def made_plan(measurement: LoadMeasurement, coarse: Run, source: Path, division:
         extent=measurement.scene.extent,
         finish_steps=finish_steps(config),
         blocks=tuple(blocks),
+        sky=None if loads.sky is None else loads.sky.sphere,
         joined=tuple(joined),
         photographs=len(photographs),
         gaussians=len(measurement.model),

@@ -40,10 +40,11 @@ def plan_table(plan: BlockPlan) -> list[tuple[str, ...]]:
 
 def plan_total(plan: BlockPlan) -> str:
     """Return a line with the photographs of all blocks together, and their ratio to the scene's."""
-    total = sum(len(block.photographs) for block in plan.blocks)
-    blocks = "1 block" if len(plan.blocks) == 1 else f"{len(plan.blocks):,} blocks"
+    total = sum(len(block.photographs) for block in plan.cells)
+    blocks = "1 block" if len(plan.cells) == 1 else f"{len(plan.cells):,} blocks"
     times = f"{total / max(plan.photographs, 1):.2f} times"
-    return f"{blocks} with {total:,} photographs in all, {times} the scene's {plan.photographs:,}"
+    sky = next((f"; {len(block.photographs):,} show the sky" for block in plan.blocks if block.is_sky), "")
+    return f"{blocks} with {total:,} photographs in all, {times} the scene's {plan.photographs:,}{sky}"
 
 
 def plan_svg(plan: BlockPlan, cameras: Mapping[str, Float64]) -> str:
@@ -64,12 +65,12 @@ def plan_svg(plan: BlockPlan, cameras: Mapping[str, Float64]) -> str:
         x, y = (min(max(value, low), high) - low for value, low, high in zip(place, view.low, view.high, strict=True))
         return PICTURE_EDGE_PX + scale * x, PICTURE_EDGE_PX + height - scale * y
 
-    times = Counter(name for block in plan.blocks for name in block.photographs)
+    times = Counter(name for block in plan.cells for name in block.photographs)
     body = [
-        *(_cell(block, index, pixel) for index, block in enumerate(plan.blocks)),
-        *(_outline(block.widened, CELL_COLOURS[index % 8], pixel) for index, block in enumerate(plan.blocks)),
+        *(_cell(block, index, pixel) for index, block in enumerate(plan.cells)),
+        *(_outline(block.widened, CELL_COLOURS[index % 8], pixel) for index, block in enumerate(plan.cells)),
         *(_dot(pixel((place[0], place[1])), times[name]) for name, place in zip(sorted(cameras), places, strict=True)),
-        *(_label(block, pixel) for block in plan.blocks),
+        *(_label(block, pixel) for block in plan.cells),
     ]
     bottom = height + 2 * PICTURE_EDGE_PX
     counts = Counter(min(times[name], 3) for name in cameras)
@@ -90,7 +91,7 @@ def plan_svg(plan: BlockPlan, cameras: Mapping[str, Float64]) -> str:
 
 def _view(plan: BlockPlan, places: Float64) -> Rectangle:
     """Return the part of the ground on the map: all cameras, and all finite edges of cells, with a border."""
-    corners = [corner for block in plan.blocks for corner in (block.widened.low, block.widened.high)]
+    corners = [corner for block in plan.cells for corner in (block.widened.low, block.widened.high)]
     along = [
         [value for value in [*places[:, axis].tolist(), *(corner[axis] for corner in corners)] if isfinite(value)]
         for axis in (0, 1)

@@ -25,7 +25,7 @@ class BlocksTrainVerb(Verb):
 
     city: CityFolder
     """Folder with the plan (clsplat blocks plan)."""
-    block: Annotated[str, arg(metavar="I,J|K")]
+    block: Annotated[str, arg(metavar="I,J|sky|K")]
     """Name of the block, as in the plan, or its number in the order of the plan, from 0 on. A number for which there is
     no block is no error, so that an array of jobs may have more jobs than there are blocks."""
     progress: TrainingProgress = "auto"

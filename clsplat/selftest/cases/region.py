@@ -35,19 +35,22 @@ NO_LIMIT = np.float32(-1e30)
 
 
 def _random(rng: Generator, count: int) -> Inputs:
-    """A random view, and a region with a Gaussian on each of its edges. slots: (n, FIELDS.floats), summed by
-    Gaussian."""
+    """A random view, and a region with a Gaussian on each of its edges, and one on its sphere. slots: (n,
+    FIELDS.floats), summed by Gaussian."""
     given = random_scene(rng, count)
     axes = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
     means = given.gaussians.means
     at = TrainedRegion(axes, np.full(2, -np.inf), np.full(2, np.inf)).coordinates(means).astype(np.float64)
     low, high = np.sort(at, axis=0)[[count // 5, -1 - count // 5]]
     high[1] = np.inf
+    squares = np.sort(TrainedRegion(axes, low, np.full(2, np.inf), middle := means.mean(axis=0)).squares(means))
+    radius = float(np.sqrt(squares[count // 2].astype(np.float64)))
+    limits = ({}, {"nearest": radius}, {"farthest": radius or 1.0})[rng.integers(3)]
     means[rng.random(count) < 0.02] = np.nan
     high = np.where(low < high, high, low + 1)
     return Inputs(
         **vars(given),
-        region=TrainedRegion(axes, low, high),
+        region=TrainedRegion(axes, low, high, middle, **limits),
         slots=rng.normal(size=(count, FIELDS.floats)).astype(np.float32),
         sparse=bool(rng.random() < 0.3),
     )
