@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from dataclasses import replace
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import refusal
+from calls import raising, refusal
 from compare import assert_same_bits
 from small_city import BLOCK_STEPS, FINISH_STEPS, WHOLE, in_cell, load, trains_on
 
@@ -21,6 +22,7 @@ from clsplat.blocks.plan import SKY_BLOCK, Block, Rectangle, Sky, read_plan, wri
 from clsplat.blocks.tasks import tasks_of
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
+from clsplat.runs import locks
 from clsplat.runs.run import Run
 from clsplat.runs.scene_record import read
 from clsplat.scenes.loading import load_scene_of
@@ -58,6 +60,17 @@ def test_the_merge_has_each_cell_from_its_block(done_city: Path) -> None:
         model = Gaussians.load(done_city / "blocks" / block.name / "model.ply")
         parts.append(model.means[in_cell(model, block.cell)])
     assert_same_bits(Gaussians.load(done_city / "merged.ply").means, np.concatenate(parts))
+
+
+def test_a_block_in_a_folder_without_locks(
+    city: Path, done_city: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is said, and the bytes are the same."""
+    monkeypatch.setattr(locks, "try_lock", raising(OSError(errno.ENOLCK, "No locks available")))
+    with pytest.warns(UserWarning, match="is on a file system without locks"):
+        assert train_block(city, "0,0", load(), trains_on(default_device))
+    model = Path("blocks", "0_0", "model.ply")
+    assert (city / model).read_bytes() == (done_city / model).read_bytes()
 
 
 def test_the_sky_is_a_block_of_its_own(city: Path, default_device: Device) -> None:
