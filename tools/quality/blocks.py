@@ -218,8 +218,10 @@ def blocks(given: Namespace) -> Rows:
     done = trained(
         given, "whole", town, settings=f"{settings},{count}", iterations=round(EXTRA_STEPS * given.iterations)
     )
-    of_blocks = sum(len(block.photographs) for block in plan.blocks)
-    yield f"photographs of all blocks / of the scene: {of_blocks / len(scene.train_views):.2f}"
+    cells, sky = sum(len(block.photographs) for block in plan.cells), sum(b.iterations for b in plan.blocks if b.is_sky)
+    passes = sum(block.iterations for block in plan.cells) / cells
+    yield f"photographs of all blocks / of the scene: {cells / len(scene.train_views):.2f}"
+    yield f"steps of the sky, in photographs of as many passes: {sky / passes / len(scene.train_views):.2f}"
     yield "model", "Gaussians", "PSNR, dB", "band", "elsewhere", "band less elsewhere"
     everything = {"whole": done.model, **models}
     ground = ground_of(renderer, done.model, scene.test_views, plan)
@@ -303,37 +305,45 @@ def from_outside(scene: Scene, plan: BlockPlan) -> list[Camera]:
 
 
 def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str) -> Rows:
-    """Steps of colour across the borders of a town whose exposure drifts, and across lines beside them."""
+    """Steps of colour across the borders of a town whose exposure drifts, and across lines beside them: of the whole
+    against the photographs, and of the blocks also against the whole, whose own errors then cancel."""
     town = town_of(given, given.exposure)
     settings = f"{settings},appearance=exposure"
     city = city_of(given, town, "exposure", settings)
     with own_appearance():
         other = city_of(given, town, "exposure own", settings, planned=city)
-    plan = read_plan(city)
-    borders = borders_of(plan)
-    beside = [replace(border, at=border.at + BESIDE_METRES) for border in borders]
-    clean = [view.load()[:, :, :3] for view in scene.views]
+    whole = trained(given, "whole exposure", town, settings=settings, iterations=round(EXTRA_STEPS * given.iterations))
+    borders = borders_of(read_plan(city))
+    beside = [replace(border, at=border.at + side * BESIDE_METRES) for border in borders for side in (-1, 1)]
+
+    def drawn(model: Gaussians) -> list[Float32]:
+        return [renderer.render(model, view.camera).image for view in scene.views]
+
+    clean, of_whole = [view.load()[:, :, :3] for view in scene.views], drawn(whole.model)
     yield (
         "appearance of blocks",
         "model",
         "mean step of colour, levels",
         "largest",
-        "beside the borders: mean",
+        "beside the borders",
+        "against the whole: mean",
         "largest",
+        "beside the borders",
     )
-    ground = ground_of(renderer, models_of(city)["finished"], scene.views, plan)
-    kinds = {
-        "of the coarse model": city,
-        "their own": other,
-        "exposure without drift": given.folder / "cities" / "frozen",
-    }
-    for kind, folder in kinds.items():
-        for name, model in models_of(folder).items():
-            images = [renderer.render(model, view.camera).image for view in scene.views]
-            across, along = (colour_steps(images, clean, ground, lines) for lines in (borders, beside))
-            yield kind, name, *(f"{value:.2f}" for steps in (across, along) for value in (np.mean(steps), max(steps)))
-            shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
-            place = int(np.argmax(shares))
-            file = f"{scene.views[place].name.replace('/', '-')}-{kind.replace(' ', '-')}-{name}.png"
-            write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
+    ground = ground_of(renderer, whole.model, scene.views, read_plan(city))
+    shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
+    place = int(np.argmax(shares))
+    kinds = {"of the coarse model": city, "their own": other}
+    models = {(kind, name): model for kind, folder in kinds.items() for name, model in models_of(folder).items()}
+    for (kind, name), images in {
+        ("-", "whole"): of_whole,
+        **{key: drawn(model) for key, model in models.items()},
+    }.items():
+        cells = list[str]()
+        for judge in (clean, of_whole):
+            across, along = (colour_steps(images, judge, ground, lines) for lines in (borders, beside))
+            cells += [f"{value:.2f}" for value in (np.mean(across), max(across), np.mean(along))]
+        yield kind, name, *(cells[:3] if images is of_whole else cells)
+        file = f"{scene.views[place].name.replace('/', '-')}-{kind.replace(' ', '-')}-{name}.png"
+        write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
     return 0
