@@ -45,12 +45,12 @@ def _random(rng: Generator, count: int) -> Inputs:
     high[1] = np.inf
     squares = np.sort(TrainedRegion(axes, low, np.full(2, np.inf), middle := means.mean(axis=0)).squares(means))
     radius = float(np.sqrt(squares[count // 2].astype(np.float64)))
-    limits = ({}, {"nearest": radius}, {"farthest": radius or 1.0})[rng.integers(3)]
+    nearest, farthest = ((0.0, np.inf), (radius, np.inf), (0.0, radius or 1.0))[rng.integers(3)]
     means[rng.random(count) < 0.02] = np.nan
     high = np.where(low < high, high, low + 1)
     return Inputs(
         **vars(given),
-        region=TrainedRegion(axes, low, high, middle, **limits),
+        region=TrainedRegion(axes, low, high, middle, nearest, farthest),
         slots=rng.normal(size=(count, FIELDS.floats)).astype(np.float32),
         sparse=bool(rng.random() < 0.3),
     )
