@@ -19,7 +19,7 @@ from groups import begin_apart, group_of, in_one_order
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = """
 from groups import scheduler
-def pytest_xdist_make_scheduler(config, log): return scheduler(config, log, {0: "fast-1.0", 1: "fast-1.0-new"})
+def pytest_xdist_make_scheduler(config, log): return scheduler(config, log, {0: "fast-1.0", 1: "fast-1.0-new"}, {})
 """
 NOTES = """
 import os, pytest
@@ -143,14 +143,15 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
         ("tests/stages/test_sort.py::test_it", "test_sort"),
         ("tests/stages/test_sort.py::test_it[64-cloud]", "test_sort"),
         ("tests/stages/test_fast-1.0.py::test_it[64]", "test_fast-1.0"),
-        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0 in 8x1"),
+        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0"),
+        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-new-cloud]", "driver 1 in 8x1"),
         ("tests/stages/test_sort.py::test_it[1x32g-fast-1.0-new-8x1]", "driver 1 in 1x32g"),
         ("tests/stages/test_sort.py::test_it[fast-1.0-8x1]", "driver 0"),
         ("tests/stages/test_blend.py::test_it[fast-1.0-new-a/b]", "driver 1"),
     ],
 )
 def test_a_driver_s_tests_in_a_shape_are_a_group_and_else_a_file_s(identifier: str, wanted: str) -> None:
-    assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}) == wanted
+    assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}, {0: "8x1", 1: "16x1"}) == wanted
 
 
 def collected(folder: Path, source: pytest.Config.ArgsSource, **process: Any) -> list[str]:
