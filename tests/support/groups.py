@@ -2,8 +2,9 @@
 """Groups of tests that run in the same process with `-n 2 --dist loadgroup`.
 
 Tests for the same driver in the same shape are a group, so that its kernels are built only once, which takes most of
-the time; each shape has builds of its own. Tests that name no shape have the driver's own. Other tests of a file are a
-group, because they share fixtures.
+the time; each shape has builds of its own. Tests that name no shape have the driver's own. Shapes with and without a
+Gaussian per work-item share all kernels but one, and are a group. Other tests of a file are a group, because they share
+fixtures.
 Groups follow from the tests' identifiers. The marker of pytest-xdist 3.8 has no effect with pytest 9.2.
 """
 
@@ -29,7 +30,7 @@ def group_of(identifier: str, drivers: Mapping[int, str], own: Mapping[int, str]
     named = [index for index, words in drivers.items() if words in parameters]
     if not named:
         return PurePath(file).stem
-    driver, shape = max(named, key=lambda index: len(drivers[index])), re.match(r"\d+x\d+g?(?=-)", parameters)
+    driver, shape = max(named, key=lambda index: len(drivers[index])), re.match(r"\d+x\d+(?=g?-)", parameters)
     return f"driver {driver} in {shape[0]}" if shape and shape[0] != own.get(driver) else f"driver {driver}"
 
 

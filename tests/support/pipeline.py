@@ -62,10 +62,11 @@ def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tup
     The first is `cpu_shape`, the second that of COMMON_SHAPES for GPUs.
 
     every: for the default driver, also return the shape of one lane and one item, a mixed one, one with a Gaussian per
-        work-item, and `more`. tools/ci/digests.py tests every driver in every shape.
+        work-item, and `more`. The one by Gaussian has a kernel of its own, and shares the others with the second shape.
+        tools/ci/digests.py tests every driver in every shape.
     """
     two = cpu_shape(device), COMMON_SHAPES[1]
-    return (*two, (1, 1), (8, 16), (1, 32, True), *more) if every and device is open_device() else two
+    return (*two, (1, 1), (8, 16), (1, 64, True), *more) if every and device is open_device() else two
 
 
 def has_slow_parameters(index: int, shape: tuple[Any, ...] | None) -> bool:

@@ -147,7 +147,7 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
         ("tests/stages/test_fast-1.0.py::test_it[64]", "test_fast-1.0"),
         ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0"),
         ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-new-cloud]", "driver 1 in 8x1"),
-        ("tests/stages/test_sort.py::test_it[1x32g-fast-1.0-new-8x1]", "driver 1 in 1x32g"),
+        ("tests/stages/test_sort.py::test_it[1x32g-fast-1.0-new-8x1]", "driver 1 in 1x32"),
         ("tests/stages/test_sort.py::test_it[fast-1.0-8x1]", "driver 0"),
         ("tests/stages/test_blend.py::test_it[fast-1.0-new-a/b]", "driver 1"),
     ],
