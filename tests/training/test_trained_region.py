@@ -296,7 +296,7 @@ def test_steps_over_chunks(
     assert 0 < len(means) < len(found[0]["parameters/means"]) - len(frozen) + 100
 
 
-@pytest.mark.parametrize("name", quick(["antialiased", "MCMC", "batch", "late"], "antialiased"))
+@pytest.mark.parametrize("name", quick(["antialiased", "MCMC", "batch", "late"], "MCMC"))
 def test_in_less_memory(name: str, folder: Path, default_device: Device) -> None:
     """A model whose parts come to the device one after the other, since these steps run over the whole model."""
     config, found = replace(SETTINGS[name], density=replace(SETTINGS[name].density, max_gaussians=5000)), []
