@@ -168,7 +168,7 @@ def test_in_every_shape(shaped_device: Device) -> None:
 
 @pytest.mark.slow
 def test_all_scenes_in_the_other_shapes_of_a_cpu(default_device: Device) -> None:
-    """Those that no driver here has as its own, as `test_every_driver_here_passes` has these."""
+    """Shapes that no driver here has as its own. In the drivers' own, tools/ci/digests.py compares larger frames."""
     others = {8, 16} - {shape_of(device)[0].lanes for device in all_devices()}
     results = [result for lanes in sorted(others) for result in run(shaped(default_device, lanes, 1))]
     assert len(results) == len(others) * len(SELFTEST_STAGES)
