@@ -26,7 +26,7 @@ from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from groups import begin_apart, in_one_order, scheduler
 from needs import missing
 from passed import leave_out, pytest_addoption, record  # noqa: F401  # a hook
-from pipeline import COMMON_SHAPES, DEFAULT, has_slow_parameters, shaped, shapes_of
+from pipeline import DEFAULT, cpu_shape, has_slow_parameters, shaped, shapes_of
 from same_bytes import undisturbed  # noqa: F401  # a fixture
 from tiny import CONFIG, FEW, short, write_scene
 
@@ -57,7 +57,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    return scheduler(config, log, {index: label(index) for index in KEPT})
+    own = {index: open_device(str(index)).shape.label for index in KEPT}
+    return scheduler(config, log, {index: label(index) for index in KEPT}, own)
 
 
 def _driver_and_shape(item: pytest.Item) -> tuple[Any, Any]:
@@ -87,7 +88,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=list(pairs))
     items[:] = [item for item in items if item not in pairs]
     for item in items:
-        if _driver_and_shape(item)[1] not in {None, COMMON_SHAPES[0]}:
+        index, shape = _driver_and_shape(item)
+        if shape is not None and shape != cpu_shape(open_device(str(index))):
             item.add_marker(pytest.mark.slow)
         for marker in item.iter_markers("needs"):
             if reason := missing(*marker.args):

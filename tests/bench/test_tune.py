@@ -198,6 +198,7 @@ def test_a_user_without_a_home(default_device: Device, monkeypatch: pytest.Monke
         save_shape(device, default_shape(device))
 
 
+@pytest.mark.slow
 def test_measure_in_several_shapes(default_device: Device) -> None:
     for shape in ((8, 1), (1, 64)):
         assert tune.measure(shaped(default_device, *shape), (300, 70, 50), repeat=1) > 0

@@ -157,8 +157,11 @@ def test_what_is_half_changed_is_not_kept(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("config", [LATE, WITHOUT], ids=["dense", "sparse"])
-@pytest.mark.parametrize(("how", "name", "step"), [("launch", "gather_rows", 15), ("abort", "NO_SH_REST", 12)])
+@pytest.mark.parametrize(
+    ("how", "name", "step", "config"),
+    [("launch", "gather_rows", 15, WITHOUT), ("abort", "NO_SH_REST", 12, LATE)],
+    ids=["a launch in a sparse step", "a build of a dense step"],
+)
 def test_the_checkpoint_of_a_late_failure(
     how: str, name: str, step: int, config: TrainConfig, standing: Standing, scene: Path, tmp_path: Path,
     standing_device: Device, capsys: Capture, monkeypatch: pytest.MonkeyPatch,

@@ -61,14 +61,15 @@ def test_the_parts_have_every_step_once(tmp_path: Path) -> None:
 def test_the_first_failure_ends_the_run_with_the_table(tmp_path: Path) -> None:
     result = ran(tmp_path, **{"ruff format": "bash -c 'exit 7'"})
     assert result.returncode == 1 and "all passed" not in result.stdout
-    assert rows(result.stdout) == ["environment", "ruff check", "ruff format (failed)", "in all"]
+    before = ["newcomer: clone", "newcomer: tools/demo", "environment", "ruff check"]
+    assert rows(result.stdout) == [*before, "ruff format (failed)", "in all"]
     assert "== FAILED: ruff format (status 7 after " in result.stderr
 
 
 def test_a_step_beside_others_fails_where_it_is_waited_for(tmp_path: Path) -> None:
     result = ran(tmp_path, mypy="bash -c 'echo an error; exit 7'")
     assert result.returncode == 1 and "all passed" not in result.stdout
-    assert rows(result.stdout)[-3:] == ["newcomer: tools/demo", "mypy (failed)", "in all"]
+    assert rows(result.stdout)[-3:] == ["newcomer: tools/test", "mypy (failed)", "in all"]
     assert "an error" in result.stdout.splitlines() and "== FAILED: mypy (status 7 after " in result.stderr
 
 
@@ -85,9 +86,9 @@ def test_a_step_is_beside_several_others_at_the_lowest_priority(tmp_path: Path) 
 def test_a_step_beside_others_ends_with_the_run(tmp_path: Path) -> None:
     process = tmp_path.with_suffix(".process")
     begun = f"while [ ! -s {process} ]; do sleep 0.01; done; exit 7"
-    steps = {"mypy": f"bash -c 'echo $$ >{process}; sleep 600; true'", "newcomer: clone": f"bash -c '{begun}'"}
-    result = ran(tmp_path, **steps)
-    assert result.returncode == 1 and rows(result.stdout)[-2:] == ["newcomer: clone (failed)", "in all"]
+    beside = f"bash -c 'echo $$ >{process}; sleep 600; true'"
+    result = ran(tmp_path, **{"environment": beside, "newcomer: tools/demo": f"bash -c '{begun}'"})
+    assert result.returncode == 1 and rows(result.stdout)[-2:] == ["newcomer: tools/demo (failed)", "in all"]
     with pytest.raises(ProcessLookupError):
         _wait_until_gone(int(process.read_text()))
 

@@ -53,9 +53,13 @@ def made(count: int = 32, distances: tuple[float, ...] = (4.0,)) -> Scene:
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     colors = rng.uniform(0.2, 0.8, (6000, 3)).astype(np.float32)
     lens = Lens("PINHOLE", ACROSS, DOWN, (0.9 * ACROSS, 0.9 * ACROSS, ACROSS / 2, DOWN / 2))
-    views, thumbnails = [], {}
-    for index in range(count):
-        camera = camera_at(2 * np.pi * index / count, distances[index % len(distances)])
+    cameras = [camera_at(2 * np.pi * index / count, distances[index % len(distances)]) for index in range(count)]
+    paths = [Path(f"{index:02d}.png") for index in range(count)]
+    views = [View(path.name, camera, path, "train", lens) for path, camera in zip(paths, cameras, strict=True)]
+    scene = Scene("made", views, points, colors, (-np.ones(3), np.ones(3)))
+    thumbnails = {}
+    for index, view in enumerate(scene.sampled_views):  # all, but of a thousand
+        camera = view.camera
         local = points @ camera.rotation.T + camera.translation
         places = (local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]).astype(int)
         pixels = rng.uniform(0.45, 0.55, (DOWN, ACROSS, 3)).astype(np.float32)
@@ -63,11 +67,10 @@ def made(count: int = 32, distances: tuple[float, ...] = (4.0,)) -> Scene:
         x, y = (places[order, None, :] + SQUARE).reshape(-1, 2).T
         inside = (x >= 0) & (x < ACROSS) & (y >= 0) & (y < DOWN)
         pixels[y[inside], x[inside]] = colors[np.repeat(order, len(SQUARE))[inside]]  # of equal places the last counts
-        view = View(f"{index:02d}.png", camera, Path(f"{index:02d}.png"), "train", lens)
-        views.append(view)
         thumbnails[view.name] = Thumbnail(pixels, 0.0, 0.6 + 0.02 * (index % 5))
-    scene = Scene("made", views, points, colors, (-np.ones(3), np.ones(3)))
     scene.__dict__["thumbnails"] = thumbnails
+    for name in ("sampled_views", "train_views"):  # views may be changed
+        scene.__dict__.pop(name, None)
     return scene
 
 

@@ -2,7 +2,9 @@
 """Groups of tests that run in the same process with `-n 2 --dist loadgroup`.
 
 Tests for the same driver in the same shape are a group, so that its kernels are built only once, which takes most of
-the time; each shape has builds of its own. Other tests of a file are a group, because they share fixtures.
+the time; each shape has builds of its own. Tests that name no shape have the driver's own. Shapes with and without a
+Gaussian per work-item share all kernels but one, and are a group. Other tests of a file are a group, because they share
+fixtures.
 Groups follow from the tests' identifiers. The marker of pytest-xdist 3.8 has no effect with pytest 9.2.
 """
 
@@ -17,31 +19,35 @@ import pytest
 from xdist.scheduler import LoadScopeScheduling
 
 
-def group_of(identifier: str, drivers: Mapping[int, str]) -> str:
-    """The group of a test. drivers: by index, the words that name a driver in the tests' identifiers."""
+def group_of(identifier: str, drivers: Mapping[int, str], own: Mapping[int, str]) -> str:
+    """The group of a test.
+
+    drivers: by index, the words that name a driver in the tests' identifiers.
+    own: by index, the label of the shape that a driver has by default.
+    """
     file, _, rest = identifier.partition("::")
     parameters = rest.partition("[")[2]
     named = [index for index, words in drivers.items() if words in parameters]
     if not named:
         return PurePath(file).stem
-    driver, shape = max(named, key=lambda index: len(drivers[index])), re.match(r"\d+x\d+g?(?=-)", parameters)
-    return f"driver {driver} in {shape[0]}" if shape else f"driver {driver}"
+    driver, shape = max(named, key=lambda index: len(drivers[index])), re.match(r"\d+x\d+(?=g?-)", parameters)
+    return f"driver {driver} in {shape[0]}" if shape and shape[0] != own.get(driver) else f"driver {driver}"
 
 
 class ByDriver(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
     """pytest-xdist's scheduler that keeps the tests of a scope together, with these groups as scopes."""
 
-    def __init__(self, config: pytest.Config, log: Any, drivers: Mapping[int, str]) -> None:
+    def __init__(self, config: pytest.Config, log: Any, drivers: Mapping[int, str], own: Mapping[int, str]) -> None:
         super().__init__(config, log)
-        self._drivers = drivers
+        self._drivers, self._own = drivers, own
 
     def _split_scope(self, nodeid: str) -> str:
-        return group_of(nodeid, self._drivers)
+        return group_of(nodeid, self._drivers, self._own)
 
 
-def scheduler(config: pytest.Config, log: Any, drivers: Mapping[int, str]) -> ByDriver | None:
-    """The scheduler for pytest-xdist; None without `--dist loadgroup`."""
-    return ByDriver(config, log, drivers) if config.getvalue("dist") == "loadgroup" else None
+def scheduler(config: pytest.Config, log: Any, drivers: Mapping[int, str], own: Mapping[int, str]) -> ByDriver | None:
+    """The scheduler for pytest-xdist; None without `--dist loadgroup`. drivers, own: those of `group_of`."""
+    return ByDriver(config, log, drivers, own) if config.getvalue("dist") == "loadgroup" else None
 
 
 def begin_apart(config: pytest.Config) -> None:

@@ -32,7 +32,7 @@ BACKGROUND = (0.1, 0.2, 0.3)
 
 
 COMMON_SHAPES = (8, 1), (1, 64)
-"""Lanes and items of the shapes that every driver is tested in: one for CPUs, and one for GPUs."""
+"""Lanes and items of the shapes that the default driver is always tested in: one for CPUs, and one for GPUs."""
 DEFAULT = [index for index in KEPT if open_device(str(index)) is open_device()]
 """Index of the default driver; none without a driver."""
 
@@ -42,18 +42,31 @@ EVERY_SHAPE = pytest.mark.parametrize(
     [pytest.param(index, every := index in DEFAULT, id=f"{label(index)}{'-every' if every else ''}") for index in KEPT],
     indirect=["device"],
 )
-"""Mark of a test that runs several shapes at once: all on the default driver, and on other drivers COMMON_SHAPES, since
-builds take most of the time."""
+"""Mark of a test that runs several shapes at once: all on the default driver, and two on others, since builds take most
+of the time."""
+
+
+def cpu_shape(device: Device) -> tuple[int, int]:
+    """Lanes and items of the shape for CPUs in which a driver is tested.
+
+    Drivers other than the default one are tested in the shape that they have by default if it is one for CPUs. Tests of
+    the fixtures `device` and `shaped_device` then share kernels. tools/ci/digests.py tests every driver in (8, 1).
+    """
+    own = device.shape
+    return COMMON_SHAPES[0] if device is open_device() or own.items > 1 else (own.lanes, own.items)
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
     """Shapes in which a driver is tested: (lanes, items), or (lanes, items, True) for a Gaussian per work-item.
 
+    The first is `cpu_shape`, the second that of COMMON_SHAPES for GPUs.
+
     every: for the default driver, also return the shape of one lane and one item, a mixed one, one with a Gaussian per
-        work-item, and `more`. tools/ci/digests.py tests every driver in every shape.
+        work-item, and `more`. The one by Gaussian has a kernel of its own, and shares the others with the second shape.
+        tools/ci/digests.py tests every driver in every shape.
     """
-    every = every and device is open_device()
-    return (*COMMON_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else COMMON_SHAPES
+    two = cpu_shape(device), COMMON_SHAPES[1]
+    return (*two, (1, 1), (8, 16), (1, 64, True), *more) if every and device is open_device() else two
 
 
 def has_slow_parameters(index: int, shape: tuple[Any, ...] | None) -> bool:
@@ -67,13 +80,16 @@ def has_slow_parameters(index: int, shape: tuple[Any, ...] | None) -> bool:
 
 @cache
 def shaped(device: Device, lanes: int, items: int, by_gaussian: bool = False) -> Device:
-    """The device in another shape. All tests share it, because each new one builds its kernels again.
+    """The device in a shape; the same device if the shape is its own. All tests share the result, because each new
+    device builds its kernels again.
 
     Skips the test if the driver would crash the process in this shape.
     """
+    if (label := f"{lanes}x{items}{'g' if by_gaussian else ''}") == device.shape.label:
+        return device
     if reason := why_not(all_devices().index(device.cl_device), lanes, items):
         pytest.skip(reason)
-    return device.with_shape(f"{lanes}x{items}{'g' if by_gaussian else ''}")
+    return device.with_shape(label)
 
 
 @dataclass

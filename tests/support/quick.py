@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choice of the parameters that quick runs test. The others get the marker `slow`, and run in CI.
 
-Where a test runs on each driver or in each shape, the others run on the default driver alone, in the two shapes
-that all drivers have (`pipeline.has_slow_parameters`).
+Where a test runs on each driver or in each shape, the others run on the default driver alone, in COMMON_SHAPES
+(`pipeline.has_slow_parameters`).
 """
 
 from __future__ import annotations

@@ -68,6 +68,7 @@ def test_library(capsys: Capture) -> None:
     assert (result["gaussians"], result["width"], result["height"]) == (300, 40, 30)
 
 
+@pytest.mark.slow
 def test_host(scene_folder: Path, capsys: Capture) -> None:
     """In groups: a step's launches are all replayed, and its camera is on the device."""
     flags = ["--size", WIDTH, "--steps", "20", "--shape", "1x64", "--repeat", "3"]

@@ -17,7 +17,7 @@ from groups import scheduler
 from passed import leave_out, pytest_addoption, record
 
 def pytest_xdist_make_scheduler(config, log):
-    return scheduler(config, log, {1: "driver-1.0"})
+    return scheduler(config, log, {1: "driver-1.0"}, {})
 
 def pytest_configure(config):
     record(config)

@@ -16,7 +16,7 @@ from stress_limits import Case, Result, Trainings
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError
 
-SMALL = ["--gaussians", "7e4", "--steps", "20", "--views", "4", "--kills", "1"]
+SMALL = ["--gaussians", "7e4", "--steps", "12", "--views", "2", "--kills", "1"]
 """More than 65,536 Gaussians, so that the model has chunks."""
 
 

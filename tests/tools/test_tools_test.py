@@ -19,7 +19,7 @@ from groups import begin_apart, group_of, in_one_order
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = """
 from groups import scheduler
-def pytest_xdist_make_scheduler(config, log): return scheduler(config, log, {0: "fast-1.0", 1: "fast-1.0-new"})
+def pytest_xdist_make_scheduler(config, log): return scheduler(config, log, {0: "fast-1.0", 1: "fast-1.0-new"}, {})
 """
 NOTES = """
 import os, pytest
@@ -70,16 +70,16 @@ def commands(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[list[str
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [
-        ("", "-n 2 --dist loadgroup"),
-        ("--all", "-n 2 --dist loadgroup -m ''"),
-        ("-k ply --no-header", "-n 2 --dist loadgroup -k ply --no-header"),
-        ("--all -x tests/models/test_ply.py", "-n 2 --dist loadgroup -m '' -x tests/models/test_ply.py"),
+        ("", "-n 3 --dist loadgroup"),
+        ("--all", "-n 3 --dist loadgroup -m ''"),
+        ("-k ply --no-header", "-n 3 --dist loadgroup -k ply --no-header"),
+        ("--all -x tests/models/test_ply.py", "-n 3 --dist loadgroup -m '' -x tests/models/test_ply.py"),
         ("-n 0", "-n 0"),
         ("-n4 -q", "-n4 -q"),
         ("--numprocesses=3", "--numprocesses=3"),
         ("-p no:xdist", "-p no:xdist"),
         ("--pdb", "--pdb"),
-        ("--write-passed=told", "-n 2 --dist loadgroup --write-passed=told"),
+        ("--write-passed=told", "-n 3 --dist loadgroup --write-passed=told"),
     ],
 )
 def test_its_command_line(
@@ -98,14 +98,16 @@ def test_compiled_tests_are_kept(tool: ModuleType, commands: list[list[str]], mo
 
 
 @pytest.mark.parametrize(
-    ("cores", "free", "wanted"), [(1, None, 1), (2, None, 2), (64, None, 4), (8, 5 << 30, 2), (8, 1 << 30, 1)]
+    ("cores", "free", "wanted", "of_all"),
+    [(1, None, 2, 2), (2, None, 3, 3), (64, None, 4, 4), (8, 11 << 30, 3, 2), (8, 1 << 30, 1, 1)],
 )
 def test_as_many_processes_as_are_worth_it(
-    cores: int, free: int | None, wanted: int, tool: ModuleType, monkeypatch: pytest.MonkeyPatch
+    cores: int, free: int | None, wanted: int, of_all: int, tool: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """One more than cores; with all drivers' kernels a process takes more memory."""
     monkeypatch.setattr(tool, "cores", lambda: cores)
     monkeypatch.setattr(tool, "memory", lambda: free)
-    assert tool.processes() == wanted
+    assert (tool.processes(), tool.processes(every=True)) == (wanted, of_all)
 
 
 def test_help_installs_nothing() -> None:
@@ -143,14 +145,15 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
         ("tests/stages/test_sort.py::test_it", "test_sort"),
         ("tests/stages/test_sort.py::test_it[64-cloud]", "test_sort"),
         ("tests/stages/test_fast-1.0.py::test_it[64]", "test_fast-1.0"),
-        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0 in 8x1"),
-        ("tests/stages/test_sort.py::test_it[1x32g-fast-1.0-new-8x1]", "driver 1 in 1x32g"),
+        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0"),
+        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-new-cloud]", "driver 1 in 8x1"),
+        ("tests/stages/test_sort.py::test_it[1x32g-fast-1.0-new-8x1]", "driver 1 in 1x32"),
         ("tests/stages/test_sort.py::test_it[fast-1.0-8x1]", "driver 0"),
         ("tests/stages/test_blend.py::test_it[fast-1.0-new-a/b]", "driver 1"),
     ],
 )
 def test_a_driver_s_tests_in_a_shape_are_a_group_and_else_a_file_s(identifier: str, wanted: str) -> None:
-    assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}) == wanted
+    assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}, {0: "8x1", 1: "16x1"}) == wanted
 
 
 def collected(folder: Path, source: pytest.Config.ArgsSource, **process: Any) -> list[str]:

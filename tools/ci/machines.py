@@ -8,8 +8,8 @@
 All machines share this Python environment. They differ in drivers, environment variables, user, and the place of the
 home folder, which is new, so that every driver is used for the first time. --list prints the machines' names, --only
 selects some, and --full runs all of tools/test on some. --short leaves out machines whose drivers the machine `all`
-has, and runs the smoke tests on few. --jobs sets how many run at once, and --markdown prints the table for
-docs/machines.md.
+has, and runs the smoke tests on few, without those of single kernels. --jobs sets how many run at once, and --markdown
+prints the table for docs/machines.md.
 
 PyPI's PoCL and Intel's runtime are found in this environment. Debian's PoCL is found through CLSPLAT_DEBIAN_POCL (its
 libpocl.so) or in the system's list, and Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so). Debian's QEMU is
@@ -52,9 +52,9 @@ SMOKE = "smoke tests"
 SHORT_SMOKE = ("pypi-pocl-1-thread", "debian-pocl-sse2", "intel-corei7", "rusticl", "not-root", "odd-paths")
 """Machines with smoke tests in a short table: the least processor of each compiler, another user, odd paths. CI, which
 makes that table, has already run all tests on the drivers of the others."""
-IN_ALL = ("pypi-pocl", "debian-pocl", "intel")
+IN_ALL = ("pypi-pocl", "debian-pocl", "intel", "intel-skx")
 """Machines that a short table leaves out: `all` tests their drivers in a new home too, and other machines have each of
-these drivers alone."""
+these drivers alone. Intel's runtime builds for AVX-512 in `all` too where the processor has it."""
 
 SHORT = """
 import sys
@@ -382,7 +382,7 @@ def main(arguments: Sequence[str]) -> int:
     rows = [replace(row, steps=(*row.steps, full())) if row.name in whole else row for row in rows]
     if given.short:
         left_out = set(IN_ALL) - wanted - whole
-        rows = [row if row.name in SHORT_SMOKE else without_smoke(row) for row in rows if row.name not in left_out]
+        rows = [shortened(row) for row in rows if row.name not in left_out]
     if given.list:
         for row in rows:
             print(f"{row.name}: {row.purpose}" + (f" (not run: {row.missing})" if row.missing else ""))
@@ -390,9 +390,12 @@ def main(arguments: Sequence[str]) -> int:
     return run_all(rows, jobs=given.jobs, markdown=given.markdown)
 
 
-def without_smoke(machine: Machine) -> Machine:
-    """The machine without the step of the smoke tests."""
-    return replace(machine, steps=tuple(step for step in machine.steps if step.name != SMOKE))
+def shortened(machine: Machine) -> Machine:
+    """The machine with few smoke tests. Those of single kernels are left out, as the self-test has run these kernels,
+    and all on machines that are not in SHORT_SMOKE."""
+    few = (smoke(stages=False),) if machine.name in SHORT_SMOKE else ()
+    steps = [(few if step.name == SMOKE else (step,)) for step in machine.steps]
+    return replace(machine, steps=tuple(step for each in steps for step in each))
 
 
 def _named(rows: Sequence[Machine], flag: str, text: str) -> set[str]:
