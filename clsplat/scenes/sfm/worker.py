@@ -247,6 +247,7 @@ class Worker:
     def add_one_by_one(self, *, relaxed: bool) -> mapping.Models:
         """Recover models by incremental mapping. relaxed: as in `mapping.incremental_models`."""
         self.begin("cameras again" if relaxed else "cameras", self.count)
+        matching.find_focal_lengths(self.database)
         self.placed = 2
         return mapping.incremental_models(
             self.database,

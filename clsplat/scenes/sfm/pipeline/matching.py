@@ -12,6 +12,7 @@ import pycolmap
 
 from clsplat.scenes.sfm.pipeline import database as sfm_database
 from clsplat.scenes.sfm.pipeline import photo_pairs as sfm_pairs
+from clsplat.scenes.sfm.pipeline.pair_focal import focal_from_pairs
 from clsplat.scenes.sfm.pipeline.photo_pairs import Pair
 
 PAIRS_FILE = "pairs.txt"
@@ -134,11 +135,27 @@ def match_features(database: Path, pairs: Sequence[Pair], *, threads: int, seed:
     pairing.match_list_path = listed
     names = sfm_database.image_names(database)
     sfm_database.rename_images(database, {image: str(image) for image in names})
-    pycolmap.match_image_pairs(
-        database_path=database,
-        matching_options=options,
-        pairing_options=pairing,
-        verification_options=verification_options(seed),
-        device=pycolmap.Device.cpu,
-    )
+    # From two photographs of one camera without EXIF, pycolmap would find the camera's focal length too. That takes six
+    # times as long as a fundamental matrix, and neither mapper uses the result.
+    with sfm_database.separate_cameras(database):
+        pycolmap.match_image_pairs(
+            database_path=database,
+            matching_options=options,
+            pairing_options=pairing,
+            verification_options=verification_options(seed),
+            device=pycolmap.Device.cpu,
+        )
     sfm_database.rename_images(database, names)
+
+
+def find_focal_lengths(database: Path) -> None:
+    """Write the focal lengths of cameras without EXIF to the database, where the matched pairs tell them.
+
+    The incremental mapper tries many pairs to begin with, which takes longer without a focal length. In bonsai_photos
+    it began with a pair whose lens it found so wrongly that no third photograph followed, and searched again.
+    """
+    for camera in sfm_database.cameras_without_focal_length(database):
+        matrices = sfm_database.fundamental_matrices(database, camera.camera_id)
+        focal = focal_from_pairs(matrices, camera.width, camera.height)
+        if focal is not None:
+            sfm_database.write_focal_length(database, camera, focal)
