@@ -147,9 +147,10 @@ def match_aliked(
             done(count)
     options = pycolmap.GeometricVerifierOptions()
     options.num_threads = threads
-    pycolmap.geometric_verification(
-        database_path=database, verifier_options=options, two_view_geometry_options=verification_options(seed)
-    )
+    with sfm_database.separate_cameras(database):
+        pycolmap.geometric_verification(
+            database_path=database, verifier_options=options, two_view_geometry_options=verification_options(seed)
+        )
 
 
 def mutual_matches(one: NDArray[Any], two: NDArray[Any]) -> NDArray[np.uint32]:

@@ -135,8 +135,6 @@ def match_features(database: Path, pairs: Sequence[Pair], *, threads: int, seed:
     pairing.match_list_path = listed
     names = sfm_database.image_names(database)
     sfm_database.rename_images(database, {image: str(image) for image in names})
-    # From two photographs of one camera without EXIF, pycolmap would find the camera's focal length too. That takes six
-    # times as long as a fundamental matrix, and neither mapper uses the result.
     with sfm_database.separate_cameras(database):
         pycolmap.match_image_pairs(
             database_path=database,
