@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import shutil
-import sqlite3
 import sys
 
 import numpy as np
@@ -26,7 +26,6 @@ from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.scenes.sfm import worker
 from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
-from clsplat.scenes.sfm.pipeline import database as sfm_database
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
 PINHOLE = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
@@ -200,17 +199,6 @@ def test_a_smaller_model_is_named(photos, tmp_path, monkeypatch):
     ]
 
 
-def test_names_with_spaces_and_of_numbers_keep_their_features(tmp_path):
-    with sqlite3.connect(tmp_path / "a.db") as connection:
-        connection.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE)")
-        connection.executemany("INSERT INTO images VALUES (?, ?)", [(1, "a b.jpg"), (2, "1"), (3, "3")])
-    names = sfm_database.image_names(tmp_path / "a.db")
-    sfm_database.rename_images(tmp_path / "a.db", {image: str(image) for image in names})
-    assert sfm_database.image_names(tmp_path / "a.db") == {1: "1", 2: "2", 3: "3"}
-    sfm_database.rename_images(tmp_path / "a.db", names)
-    assert sfm_database.image_names(tmp_path / "a.db") == names
-
-
 @pytest.mark.parametrize(("count", "threads"), [(worker.MAX_SINGLE_THREAD_PHOTOS, 1), (81, 3)])
 @pytest.mark.parametrize("mapper", ["global", "incremental"])
 def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threads, tmp_path, monkeypatch):
@@ -224,7 +212,9 @@ def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threa
         told = "matching_options" if name.startswith("match") else "options"
         monkeypatch.setattr(worker.pycolmap, name, lambda told=told, **all_: given.append(all_[told]) or {})
     monkeypatch.setattr(worker.matching.sfm_database, "image_names", lambda _: {})
-    monkeypatch.setattr(worker.matching.sfm_database, "rename_images", lambda *_: None)
+    for name, stub in (("rename_images", lambda *_: None), ("separate_cameras", contextlib.nullcontext)):
+        monkeypatch.setattr(worker.matching.sfm_database, name, stub)
+    monkeypatch.setattr(worker.matching, "find_focal_lengths", lambda _: None)
     settings = sfm.SfmSettings(mapper=mapper)
     photos = [sfm_photos.Photo(name, name, 40, 30, ()) for name in names]
     work = worker.Worker(sfm.sfm_task(settings, photos, [], [], tmp_path, 3), io.StringIO())

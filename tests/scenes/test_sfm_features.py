@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which features of photographs are kept."""
+"""Which features of photographs are kept, and to which size photographs are reduced for it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 from PIL import Image as Pillow
 
 from clsplat.scenes.sfm import worker
-from clsplat.scenes.sfm.pipeline.database import keep_largest, largest_descriptors
+from clsplat.scenes.sfm.pipeline.database import feature_counts, keep_largest, largest_descriptors
+from clsplat.scenes.sfm.pipeline.features import SAMPLED_PHOTOS, sufficient_size
 
 SIZES = np.array([3.0, 1.0, 4.0, 1.0, 5.0, 9.0, 2.0, 6.0], np.float32)
 
@@ -60,3 +61,53 @@ def test_a_photograph_has_no_more_features_than_asked_for(tmp_path):
     work.extract()
     with pycolmap.Database.open(work.database) as opened:
         assert len(opened.read_keypoints(1)) == len(opened.read_descriptors(1).data) == 50
+
+
+@pytest.mark.parametrize(
+    ("features", "width", "height", "wanted"),
+    [
+        (4096, 800, 533, 1600),  # enough for all: photographs stay as they are
+        (4097, 800, 533, 792),  # 799.9, but 800 x 533 and 796 x 530.3 are no multiples of 4, 792 x 527.7 is
+        (5300, 800, 533, 696),  # 800 x 0.879 = 703, and 696 x 463.7 rounds to 464
+        (16384, 1000, 1000, 500),  # four times as many: half the sides
+        (16384, 1000, 500, 496),  # 500 x 250 is no multiple of 4, 496 x 248 is
+        (16384, 500, 1000, 496),
+        (16384, 4000, 4000, 800),  # the sample was reduced to 1600 already
+    ],
+)
+def test_photographs_with_more_features_than_are_kept_are_reduced(features, width, height, wanted):
+    sample = [(features - 100, width, height), (features, width, height), (features + 100, width, height)]
+    assert sufficient_size(sample, 4096, 1600) == wanted
+
+
+@pytest.mark.parametrize("groups", ["one", "two", "each"])
+def test_a_sample_of_many_photographs_decides_the_size_of_the_others(tmp_path, monkeypatch, groups):
+    """The photographs of a camera keep their camera, though its features are extracted in two calls."""
+    photos, names = tmp_path / "photos", [f"{index:03}.png" for index in range(70)]
+    photos.mkdir()
+    random = np.random.default_rng(0)
+    for name in names:
+        Pillow.fromarray(random.integers(0, 256, (48, 64), dtype=np.uint8)).save(photos / name)
+    cameras = {"one": [names], "two": [names[:30], names[30:]], "each": [[name] for name in names]}[groups]
+    task = {"photos": photos, "work": tmp_path, "groups": cameras, "threads": 1, "masks": [], "seed": 0}
+    task |= {"features": "sift", "max_image_size": 1600, "max_features": 5, "camera_model": "auto"}
+    calls, extract = [], pycolmap.extract_features
+
+    def noted(**options):
+        calls.append((len(options["image_names"]), options["extraction_options"].max_image_size))
+        extract(**options)
+
+    monkeypatch.setattr(pycolmap, "extract_features", noted)
+    work = worker.Worker(task, io.StringIO())
+    work.extract()
+    sizes = {size for _, size in calls}
+    assert sum(count for count, _ in calls) == 70
+    assert sum(count for count, size in calls if size == 1600) == SAMPLED_PHOTOS
+    assert len(sizes) == 2
+    assert min(sizes) < 64
+    with pycolmap.Database.open(work.database) as opened:
+        cameras_of = {image.name: image.camera_id for image in opened.read_all_images()}
+        assert len(opened.read_all_cameras()) == len(cameras)
+    assert sorted(cameras_of) == names
+    assert all(len({cameras_of[name] for name in group}) == 1 for group in cameras)
+    assert max(feature_counts(work.database).values()) == 5

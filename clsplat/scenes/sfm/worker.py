@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -177,16 +178,15 @@ class Worker:
 
         before: number of pairs of the first round, in the second round of matching.
         """
-        seed, threads = self.task["seed"], self.reproducible_threads
+        seed, threads, first = self.task["seed"], self.reproducible_threads, self.is_global_first()
         which, total = "more " if before else "", before + len(pairs)
         if self.task["features"] == "aliked":
             self.begin(f"{which}learned matches", total)
-            aliked.match_aliked(
-                self.database, pairs, threads=threads, seed=seed, done=lambda done: self.say(done=before + done)
-            )
+            learned = partial(aliked.match_aliked, done=lambda done: self.say(done=before + done))
+            learned(self.database, pairs, threads=threads, seed=seed, with_focal=first)
         else:
             self.begin(f"{which}matches", total)  # the parent counts the pairs in the database
-            matching.match_features(self.database, pairs, threads=threads, seed=seed)
+            matching.match_features(self.database, pairs, threads=threads, seed=seed, with_focal=first)
 
     def map(self) -> mapping.Models:
         """Recover camera poses and points. Returns all models.
@@ -198,12 +198,9 @@ class Worker:
         Photographs of many cameras, as from the web, have many bad first pairs. There "auto" solves for all at once
         first, and adds one photograph after another only if that places very few.
         """
-        choice = self.task["mapper"]
-        if choice == "global":
-            return self.solve_at_once()
-        at_once_first = choice == "auto" and self.has_many_cameras()
+        choice, at_once_first = self.task["mapper"], self.is_global_first()
         models = self.solve_at_once() if at_once_first else {}
-        if at_once_first and not self.places_few(models, MIN_PLACED_AT_ONCE_FRACTION):
+        if choice == "global" or (at_once_first and not self.places_few(models, MIN_PLACED_AT_ONCE_FRACTION)):
             return models
         models |= self.add_one_by_one(relaxed=False)
         if choice == "auto" and not at_once_first and self.places_few(models):
@@ -211,6 +208,10 @@ class Worker:
         if self.places_few(models):
             models |= self.add_one_by_one(relaxed=True)
         return models
+
+    def is_global_first(self) -> bool:
+        """Return True if the global mapper is the first or the only one."""
+        return self.task["mapper"] == "global" or (self.task["mapper"] == "auto" and self.has_many_cameras())
 
     def has_many_cameras(self) -> bool:
         """Return True if there are fewer than MIN_PHOTOS_PER_CAMERA photographs for each camera in the mean."""
@@ -247,6 +248,7 @@ class Worker:
     def add_one_by_one(self, *, relaxed: bool) -> mapping.Models:
         """Recover models by incremental mapping. relaxed: as in `mapping.incremental_models`."""
         self.begin("cameras again" if relaxed else "cameras", self.count)
+        matching.find_focal_lengths(self.database)
         self.placed = 2
         return mapping.incremental_models(
             self.database,

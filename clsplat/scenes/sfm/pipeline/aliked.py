@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from clsplat.errors import examples
 from clsplat.scenes.sfm.pipeline import database as sfm_database
 from clsplat.scenes.sfm.pipeline.features import camera_batches
-from clsplat.scenes.sfm.pipeline.matching import verification_options
+from clsplat.scenes.sfm.pipeline.matching import verification_cameras, verification_options
 from clsplat.scenes.sfm.pipeline.photo_pairs import Pair
 
 ALIKED_INPUTS = ("image", "max_keypoints", "min_score")
@@ -131,11 +131,12 @@ def _features_of(name: str, task: dict[str, Any], network: AlikedNetwork) -> tup
 
 
 def match_aliked(
-    database: Path, pairs: Sequence[Pair], *, threads: int, seed: int, done: Callable[[int], None]
+    database: Path, pairs: Sequence[Pair], *, threads: int, seed: int, with_focal: bool, done: Callable[[int], None]
 ) -> None:
     """Match features that are each other's nearest, in pairs of photographs, and verify the matches.
 
     pairs: numbers of photographs in the database. threads: number of threads of the verification.
+    with_focal: as in `matching.verification_cameras`.
     done: function that is called with the number of pairs that are matched.
     """
     with pycolmap.Database.open(database) as opened:
@@ -147,9 +148,10 @@ def match_aliked(
             done(count)
     options = pycolmap.GeometricVerifierOptions()
     options.num_threads = threads
-    pycolmap.geometric_verification(
-        database_path=database, verifier_options=options, two_view_geometry_options=verification_options(seed)
-    )
+    with verification_cameras(database, with_focal=with_focal):
+        pycolmap.geometric_verification(
+            database_path=database, verifier_options=options, two_view_geometry_options=verification_options(seed)
+        )
 
 
 def mutual_matches(one: NDArray[Any], two: NDArray[Any]) -> NDArray[np.uint32]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,28 @@ def rename_images(database: Path, names: dict[int, str]) -> None:
         )
 
 
+@contextlib.contextmanager
+def separate_cameras(database: Path) -> Iterator[None]:
+    """Give every photograph whose camera has no known focal length a camera of its own until the context ends."""
+    added = 1 << 30  # camera numbers from here on are unused
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        before = connection.execute(
+            "SELECT i.camera_id, i.image_id FROM images i JOIN cameras c USING (camera_id) "
+            "WHERE c.prior_focal_length = 0"
+        ).fetchall()
+        connection.executemany(
+            "INSERT INTO cameras SELECT ?, model, width, height, params, 0 FROM cameras WHERE camera_id = ?",
+            [(added + image, camera) for camera, image in before],
+        )
+        connection.executemany(
+            "UPDATE images SET camera_id = ? WHERE image_id = ?", [(added + image, image) for _, image in before]
+        )
+    yield
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        connection.executemany("UPDATE images SET camera_id = ? WHERE image_id = ?", before)
+        connection.execute("DELETE FROM cameras WHERE camera_id >= ?", (added,))
+
+
 def largest_descriptors(database: Path, ids: Sequence[int], most: int) -> list[NDArray[Any]]:
     """Return the descriptors (features, dimensions) of the largest features of each photograph.
 
@@ -117,6 +139,23 @@ def feature_counts(database: Path) -> dict[int, int]:
         return dict(connection.execute(query).fetchall())
 
 
+def feature_counts_and_sizes(database: Path) -> list[tuple[int, int, int]]:
+    """Return the number of features, the width and the height in pixels of each photograph that has been processed."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        query = (
+            "SELECT k.rows, c.width, c.height FROM keypoints k JOIN images i USING (image_id) "
+            "JOIN cameras c USING (camera_id)"
+        )
+        return connection.execute(query).fetchall()
+
+
+def camera_of(database: Path, name: str) -> int:
+    """Return the number of the camera of a photograph."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        camera: int = connection.execute("SELECT camera_id FROM images WHERE name = ?", (name,)).fetchone()[0]
+    return camera
+
+
 def verified_matches(database: Path) -> dict[tuple[int, int], NDArray[np.uint32]]:
     """Return the verified matches (M, 2) of each pair that has some: indices of features in the first and the second.
 
@@ -127,6 +166,39 @@ def verified_matches(database: Path) -> dict[tuple[int, int], NDArray[np.uint32]
         return {
             pycolmap.pair_id_to_image_pair(pair): np.frombuffer(data, np.uint32).reshape(-1, 2) for pair, data in rows
         }
+
+
+def cameras_without_focal_length(database: Path) -> list[pycolmap.Camera]:
+    """Return the pinhole cameras, with or without distortion, of which EXIF gives no focal length."""
+    with pycolmap.Database.open(database) as opened:
+        cameras = opened.read_all_cameras()
+    return [camera for camera in cameras if camera.is_perspective_pinhole() and not camera.has_prior_focal_length]
+
+
+def fundamental_matrices(database: Path, camera: int) -> NDArray[np.float64]:
+    """Return the fundamental matrices (N, 3, 3) of the pairs of photographs of one camera, except planar pairs."""
+    uncalibrated = int(pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        images = dict(connection.execute("SELECT image_id, 1 FROM images WHERE camera_id = ?", (camera,)).fetchall())
+        rows = connection.execute(
+            "SELECT pair_id, F FROM two_view_geometries WHERE config = ? AND F IS NOT NULL ORDER BY pair_id",
+            (uncalibrated,),
+        )
+        found = [
+            np.frombuffer(data).reshape(3, 3)
+            for pair, data in rows
+            if all(image in images for image in pycolmap.pair_id_to_image_pair(pair))
+        ]
+    return np.array(found).reshape(-1, 3, 3)
+
+
+def write_focal_length(database: Path, camera: pycolmap.Camera, focal: float) -> None:
+    """Write the focal length in pixels of a camera as known."""
+    with pycolmap.Database.open(database) as opened:
+        params = np.array(camera.params)
+        params[camera.focal_length_idxs()] = focal
+        camera.params, camera.has_prior_focal_length = params, True
+        opened.update_camera(camera)
 
 
 def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:
