@@ -92,10 +92,12 @@ def separate_cameras(database: Path) -> Iterator[None]:
         connection.executemany(
             "UPDATE images SET camera_id = ? WHERE image_id = ?", [(added + image, image) for _, image in before]
         )
-    yield
-    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
-        connection.executemany("UPDATE images SET camera_id = ? WHERE image_id = ?", before)
-        connection.execute("DELETE FROM cameras WHERE camera_id >= ?", (added,))
+    try:
+        yield
+    finally:
+        with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+            connection.executemany("UPDATE images SET camera_id = ? WHERE image_id = ?", before)
+            connection.execute("DELETE FROM cameras WHERE camera_id >= ?", (added,))
 
 
 def largest_descriptors(database: Path, ids: Sequence[int], most: int) -> list[NDArray[Any]]:
