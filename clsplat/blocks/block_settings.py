@@ -26,7 +26,8 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, surroundi
     surroundings: number of Gaussians outside the widened cell, which are drawn and stay as they are.
 
     Steps of the schedule are scaled by the block's fraction of the photographs, so that a densification sees the same
-    fraction of them as in a training of the whole. The SH degree is full from the start, photographs have their full
+    fraction of them as in a training of the whole. The sky's block has as many densifications in a quarter of the
+    passes, so each of them sees fewer. The SH degree is full from the start, photographs have their full
     size, and opacities are not reset, since the Gaussians have been trained already. Without resets there is no pruning
     by size either.
     """

@@ -44,8 +44,8 @@ class CellModel:
 
 
 def region_of_block(plan: BlockPlan, block: Block, *, widened: bool = False) -> TrainedRegion:
-    """Return the cell of a block, or its widened cell, as a region of the world: the part of it without the sky. The
-    block of the sky has the rest."""
+    """Return the cell of a block, or its widened cell, as a region of the world. Cells end at the sphere of the sky;
+    the block of the sky has all outside it."""
     rectangle = block.widened if widened else block.cell
     region = TrainedRegion(np.array(plan.axes), np.array(rectangle.low), np.array(rectangle.high))
     if plan.sky is None:

@@ -24,7 +24,7 @@ COARSE_FOLDER, BLOCKS_FOLDER = "coarse", "blocks"
 """Names of the folders, in a city's folder, of the coarse model's run and of the blocks' runs."""
 MAX_PLAN_BYTES = 256 << 20
 """Size limit of plan.json in bytes, enough for some million names of photographs."""
-PLAN_FORM = 1
+PLAN_FORM = 2
 """Form of plan.json that this version writes, and the only one that it reads."""
 MARGIN = 0.2
 """Width that widens a cell on each side, as a fraction of the cell's size along the same axis."""
@@ -55,8 +55,8 @@ class Block:
     """A part of the scene that is trained on its own.
 
     name: two numbers, such as "0_1", or "sky". It is also the name of the block's folder.
-    cell: the block's part of the ground. The cells of all blocks cover the plane without overlap. The cell of the sky
-        is the whole plane.
+    cell: the block's part of the ground. The cells of the ground's blocks cover the plane without overlap. The cell of
+        the sky is the whole plane.
     widened: the cell and its margin, within which the block's Gaussians are trained.
     photographs: names of the training views that belong to the block, sorted.
     iterations: number of training steps.
@@ -83,7 +83,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Sky:
-    """A sphere around the scene. The Gaussians outside it, which photographs from all blocks show, are the sky.
+    """A sphere around the scene. The Gaussians outside it are the sky, a block of its own.
 
     centre: in world coordinates.
     radius: in world units.
@@ -254,7 +254,10 @@ def _plan_of(document: Mapping[str, Any], path: Path) -> BlockPlan:
     if not names or len(set(names)) < len(names):
         raise ValueError("expected blocks, each with a name of its own")
     if (SKY_BLOCK in names) != (plan.sky is not None):
-        raise ValueError("expected a block of the sky if it is said where the sky begins, and none otherwise")
+        found = f"sky is {document['sky']!r:.60}, and the blocks are {examples(names)}"
+        raise ValueError(f"{found}; expected a block named {SKY_BLOCK} if it is said where the sky begins, else none")
+    if not plan.cells:
+        raise ValueError("expected blocks of the ground")
     return plan
 
 

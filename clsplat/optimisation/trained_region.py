@@ -67,6 +67,12 @@ class TrainedRegion:
             found = (x[:, 0] * x[:, 0] + x[:, 1] * x[:, 1]) + x[:, 2] * x[:, 2]
         return np.asarray(np.fmin(found, np.finfo(np.float32).max), np.float32)
 
+    @property
+    def _limits(self) -> Float32:
+        """Squares (2,) of the least and the largest distance from the centre; infinite beyond float32."""
+        with np.errstate(over="ignore"):
+            return np.square([self.nearest, self.farthest]).astype(np.float32)
+
     def contains(self, means: Float32, origin: Sequence[float] | Float64 = (0.0, 0.0, 0.0)) -> Bool:
         """Mask (n,), True for means (n, 3) inside, as the kernels decide it; False for means that are not finite.
 
@@ -74,8 +80,7 @@ class TrainedRegion:
         """
         local, found = self.relative_to(origin), self.coordinates(means)
         low, high = local.low.astype(np.float32), local.high.astype(np.float32)
-        nearest, farthest = np.square([self.nearest, self.farthest]).astype(np.float32)
-        squares = local.squares(means)
+        squares, (nearest, farthest) = local.squares(means), self._limits
         return np.asarray(((low <= found) & (found < high)).all(axis=1) & (nearest <= squares) & (squares < farthest))
 
     def relative_to(self, origin: Sequence[float] | Float64) -> TrainedRegion:
@@ -89,5 +94,5 @@ class TrainedRegion:
         """Arguments of the kernels (REGION_PARAMETERS in kernels/shared/region.h): axis, low and high of each axis,
         then the centre and the squares of nearest and farthest."""
         rows = np.concatenate([self.axes, self.low[:, None], self.high[:, None]], axis=1)
-        sphere = [*self.centre, self.nearest**2, self.farthest**2]
+        sphere = [*self.centre, *self._limits]
         return tuple(float(number) for number in np.append(rows, sphere).astype(np.float32))

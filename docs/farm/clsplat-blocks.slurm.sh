@@ -1,12 +1,13 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Submits a large scene in blocks to Slurm: the plan, an array with a job for each block, the merge and the finish.
+# Submits a large scene in blocks to Slurm: the plan, an array with a job for each block and one for the sky, the merge
+# and the finish.
 #
 #     BLOCKS=2x2 COUNT=5 sh clsplat-blocks.slurm.sh /shared/scene /shared/city [settings of clsplat blocks plan]
 #
 # COUNT is the number of blocks, and one more for the sky; jobs of the array without a block end at once. Both folders
-# must have the same paths on all nodes. SBATCH has further options of sbatch, such as "--gres=gpu:1 --time=8:00:00". What was interrupted goes on
-# when this script is run again. CLSPLAT names the command, if it is not clsplat.
+# must have the same paths on all nodes. SBATCH has further options of sbatch, such as "--gres=gpu:1 --time=8:00:00".
+# What was interrupted goes on when this script is run again. CLSPLAT names the command, if it is not clsplat.
 set -eu
 
 scene=$(realpath "$1")

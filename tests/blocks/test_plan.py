@@ -91,7 +91,7 @@ def test_a_missing_plan_says_how_to_make_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda plan: plan.update(clsplat_blocks=2), "clsplat_blocks is 2, expected 1"),
+        (lambda plan: plan.update(clsplat_blocks=1), "clsplat_blocks is 1, expected 2"),
         (lambda plan: plan.pop("coarse"), "'coarse' is missing"),
         (lambda plan: plan.update(axes=[[1, 0, 0]]), "is damaged"),
         (lambda plan: plan.update(up=[0, True, 0]), "True stands where a finite number"),
@@ -105,8 +105,11 @@ def test_a_missing_plan_says_how_to_make_it(tmp_path: Path) -> None:
         (lambda plan: plan["train"].update(sed=1), "'sed', which is not a setting"),
         (lambda plan: plan.update(joined=None), "is damaged"),
         (lambda plan: plan.update(sky={"centre": [0, 0, 0], "radius": 0}), "the sky begins at the distance 0.0"),
-        (lambda plan: plan.update(sky={"centre": [0, 0, 0], "radius": 3}), "expected a block of the sky if"),
-        (lambda plan: plan["blocks"][0].update(name="sky"), "expected a block of the sky if"),
+        (lambda plan: plan.update(sky={"centre": [0, 0, 0], "radius": 3}), "expected a block named sky if it is said"),
+        (
+            lambda plan: plan["blocks"][0].update(name="sky"),
+            "sky is None, and the blocks are sky, 1_0; expected a block",
+        ),
     ],
 )
 def test_damage_is_named(change: Callable[[dict[str, Any]], object], why: str, tmp_path: Path) -> None:

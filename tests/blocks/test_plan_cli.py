@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from calls import Capture
-from test_plan import PLAN
+from test_plan import PLAN, WITH_SKY
 
 from clsplat.blocks.plan import read_plan
+from clsplat.blocks.planning import measurement
 from clsplat.blocks.planning.picture import plan_svg, plan_table, plan_total
 from clsplat.cli.main import main
 from clsplat.cli.session import Services
+from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 
 SETTINGS = ("--iterations", "60", "--random-points", "200", "--warmup", "4", "--density.start", "10", "--no-report")
@@ -60,6 +63,29 @@ def test_the_same_command_again_changes_nothing(made: Path, small_scene: Path, c
     assert out[0].split() == ["block", "photographs", "Gaussians", "steps"]
     assert re.fullmatch(r"2 blocks with \d+ photographs in all, \d\.\d\d times the scene's 8", out[-1])
     assert {file: file.stat().st_mtime_ns for file in before} == before
+
+
+def test_a_plan_with_a_sky(
+    made: Path, small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """The farthest Gaussians of the model are the sky: one more block, which is trained by its name or its number."""
+    city = tmp_path / "city"
+    shutil.copytree(made / "coarse", city / "coarse")
+    monkeypatch.setattr(measurement, "SKY_EXTENTS", 0.9)
+    assert plan(small_scene, city, "--blocks", "2") == 0
+    found = read_plan(city)
+    assert [block.name for block in found.blocks] == ["0_0", "1_0", "sky"]
+    sky, largest = found.blocks[2], max(block.iterations for block in found.cells)
+    assert sky.iterations == min(round(0.25 * len(sky.photographs) * 51 / 8), largest)
+    assert sum(block.gaussians for block in found.cells) + sky.gaussians >= found.gaussians > sky.gaussians > 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith(f"the sky is one more, with {len(sky.photographs)}")
+    words = ["blocks", "train", str(city), "--device", "cpu", "--block"]
+    assert main([*words, "sky"]) == 0
+    assert main([*words, "2"]) == 0
+    assert "block sky has finished before" in capsys.readouterr().err
+    model = Gaussians.load(city / "blocks" / "sky" / "model.ply")
+    assert found.sky is not None
+    assert (np.linalg.norm(model.means - np.array(found.sky.centre), axis=1) >= 0.999 * found.sky.radius).all()
 
 
 def test_another_division_keeps_the_coarse_model(made: Path, small_scene: Path, capsys: Capture) -> None:
@@ -150,8 +176,13 @@ def test_words_after_blocks(capsys: Capture) -> None:
 def test_the_table_and_the_picture_of_a_plan() -> None:
     assert plan_table(PLAN)[1:] == [("0,0", "2", "1,000", "30"), ("1,0", "1", "900", "20")]
     assert plan_total(PLAN) == "2 blocks with 3 photographs in all, 1.00 times the scene's 3"
+    assert plan_total(WITH_SKY) == plan_total(PLAN) + "; the sky is one more, with 1"
+    assert plan_table(WITH_SKY) == [*plan_table(PLAN), ("sky", "1", "70", "9")]
     places = {"a.jpg": (0.0, 9.0, 0.0), "b ü.jpg": (0.0, 9.0, 1.0), "c.jpg": (1.0, 9.0, 2.0), "d.jpg": (5.0, 9.0, 0.0)}
     svg = plan_svg(PLAN, {name: np.array(place) for name, place in places.items()})
+    assert plan_svg(WITH_SKY, {name: np.array(place) for name, place in places.items()}).count("<rect") == svg.count(
+        "<rect"
+    )
     picture = ET.fromstring(svg)
     circles = list(picture.iter("{http://www.w3.org/2000/svg}circle"))
     assert len(circles) == 4 + 2  # and one of each colour in the legend

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.blocks.plan import Partition, Sky
 from clsplat.blocks.planning.coarse import sky_steps
-from clsplat.blocks.planning.measurement import LoadMeasurement
+from clsplat.blocks.planning.measurement import SKY_EXTENTS, LoadMeasurement
 from clsplat.blocks.planning.new_plan import divided
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
@@ -173,6 +173,19 @@ def under_the_sky(photographs: int) -> GivenLoads:
     measured.__dict__["_sky_rows"] = along > 1e3
     measured.__dict__["_sphere"] = SKY
     return measured
+
+
+def test_the_sky_begins_beyond_some_extents() -> None:
+    """Distances are from the middle of the cameras, in the world's coordinates."""
+    measured = under_the_sky(30)
+    del measured.__dict__["_sky_rows"], measured.__dict__["_sphere"]
+    middle, origin = np.array([2e6, 0.0, -5.0]), np.array([2e6, 10.0, 0.0])
+    measured.scene = cast("Any", SimpleNamespace(spread=(middle, 0.0, 0.0), extent=3.0))
+    offsets = np.array([[14.9, 0, 0], [15.1, 0, 0], [0, -15.1, 0], [0, 10, 10], [9, 9, 9]])
+    measured.model = cast("Any", SimpleNamespace(means=(offsets + middle - origin).astype(np.float32), origin=origin))
+    assert measured._sky_rows.tolist() == [False, True, True, False, True]
+    assert measured._sphere == Sky((2e6, 0.0, -5.0), SKY_EXTENTS * 3.0)
+    assert SKY_EXTENTS == 5
 
 
 def test_the_sky_is_in_no_cell() -> None:

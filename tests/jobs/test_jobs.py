@@ -15,7 +15,7 @@ from pathlib import Path
 
 import dispatching
 import pytest
-from calls import raising, refuses
+from calls import refuses
 from counting import counted, counting_task
 from systems import alive, posix
 
@@ -116,12 +116,8 @@ def test_a_killed_command_and_a_killed_attempt(tmp_path: Path) -> None:
     assert len(kills) == 2 and counted(tmp_path, "a") == 40
 
 
-@pytest.mark.parametrize("locks_work", [True, False])
-def test_two_dispatchers_share_the_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, locks_work: bool) -> None:
-    """No step is taken twice; both end when all are done. A command that has just ended may be called again. Also in a
-    folder without locks, where claims are files."""
-    if not locks_work:
-        monkeypatch.setattr(os, "lockf", raising(OSError(errno.ENOLCK, "No locks available")))
+def test_two_dispatchers_share_the_tasks(tmp_path: Path) -> None:
+    """No step is taken twice; both end when all are done. A command that has just ended may be called again."""
     tasks = [counting_task(tmp_path, str(number), 3, seconds=0.01) for number in range(6)]
     ended: list[bool] = []
 

@@ -214,7 +214,8 @@ def test_matching_and_mapping_of_few_photos_have_one_thread(mapper, count, threa
     monkeypatch.setattr(worker.matching.sfm_database, "image_names", lambda _: {})
     for name, stub in (("rename_images", lambda *_: None), ("separate_cameras", contextlib.nullcontext)):
         monkeypatch.setattr(worker.matching.sfm_database, name, stub)
-    monkeypatch.setattr(worker.matching, "find_focal_lengths", lambda _: None)
+    monkeypatch.setattr(worker.matching, "find_focal_lengths", lambda _: [])
+    monkeypatch.setattr(worker, "write_cameras", lambda *_: None)
     settings = sfm.SfmSettings(mapper=mapper)
     photos = [sfm_photos.Photo(name, name, 40, 30, ()) for name in names]
     work = worker.Worker(sfm.sfm_task(settings, photos, [], [], tmp_path, 3), io.StringIO())

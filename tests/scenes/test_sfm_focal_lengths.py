@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import sqlite3
 
 import numpy as np
@@ -11,9 +12,12 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from clsplat.scenes.sfm import worker
+from clsplat.scenes.sfm.photos import Photo
 from clsplat.scenes.sfm.pipeline import database as sfm_database
 from clsplat.scenes.sfm.pipeline import matching
 from clsplat.scenes.sfm.pipeline.pair_focal import MIN_FOCAL_PAIRS, focal_from_pairs
+from clsplat.scenes.sfm.reconstruct import SfmSettings, sfm_task
 
 WIDTH, HEIGHT, FOCAL = 800, 533, 700.0
 
@@ -104,10 +108,39 @@ def test_the_focal_length_of_the_camera_without_exif_is_written(database, planar
             geometry.inlier_matches = np.array([[0, 0]], np.uint32)
             opened.write_two_view_geometry(*pair, geometry)
     assert sfm_database.fundamental_matrices(database, 1).shape == (0 if planar else 3, 3, 3)
-    matching.find_focal_lengths(database)
+    before = matching.find_focal_lengths(database)
     with pycolmap.Database.open(database) as opened:
         first, second = opened.read_all_cameras()
     assert first.has_prior_focal_length == (not planar)
     assert first.params[:2] == pytest.approx([960.0 if planar else FOCAL] * 2, rel=0.017)
     assert first.params[2:].tolist() == [WIDTH / 2, HEIGHT / 2, 0, 0, 0, 0]
     assert second.params[:2].tolist() == [960.0, 960.0]
+    sfm_database.write_cameras(database, before)  # as before the global mapper
+    with pycolmap.Database.open(database) as opened:
+        assert not opened.read_camera(1).has_prior_focal_length
+        assert opened.read_camera(1).params[:2].tolist() == [960.0, 960.0]
+
+
+@pytest.mark.parametrize(
+    ("mapper", "many", "separate"),
+    [("incremental", True, True), ("auto", False, True), ("auto", True, False), ("global", False, False)],
+)
+def test_pairs_are_verified_without_a_focal_length_unless_the_global_mapper_is_first(
+    mapper, many, separate, tmp_path, monkeypatch
+):
+    entered = []
+
+    @contextlib.contextmanager
+    def noted(path):
+        entered.append(path)
+        yield
+
+    monkeypatch.setattr(sfm_database, "separate_cameras", noted)
+    monkeypatch.setattr(sfm_database, "image_names", lambda _: {})
+    monkeypatch.setattr(sfm_database, "rename_images", lambda *_: None)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda **_: None)
+    monkeypatch.setattr(worker.Worker, "has_many_cameras", lambda _: many)
+    photos = [Photo(f"{index}.jpg", f"{index}.jpg", 40, 30, ()) for index in range(3)]
+    task = sfm_task(SfmSettings(mapper=mapper), photos, [], [], tmp_path, 1)
+    worker.Worker(task, io.StringIO()).match_pairs([(1, 2)])
+    assert len(entered) == separate

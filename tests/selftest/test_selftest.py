@@ -81,6 +81,7 @@ BROKEN = {
     "project_grad: opacity_weight * opacity": ("opacity_weight + opacity", "penalties"),
     "noise: * s * s * by": ("* s * by", "noise"),
     "project_grad: + mean[1] * y) + mean[2] * z": ("+ mean[1] * y) - mean[2] * z", "region"),
+    "project_grad: nearest2 <= square": ("nearest2 > square", "region"),
     "adam: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "project_grad: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),

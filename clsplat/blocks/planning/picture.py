@@ -39,11 +39,13 @@ def plan_table(plan: BlockPlan) -> list[tuple[str, ...]]:
 
 
 def plan_total(plan: BlockPlan) -> str:
-    """Return a line with the photographs of all blocks together, and their ratio to the scene's."""
+    """Return a line with the photographs of the ground's blocks together, their ratio to the scene's, and the number
+    of those that show the sky."""
     total = sum(len(block.photographs) for block in plan.cells)
     blocks = "1 block" if len(plan.cells) == 1 else f"{len(plan.cells):,} blocks"
     times = f"{total / max(plan.photographs, 1):.2f} times"
-    sky = next((f"; {len(block.photographs):,} show the sky" for block in plan.blocks if block.is_sky), "")
+    shown = next((len(block.photographs) for block in plan.blocks if block.is_sky), 0)
+    sky = f"; the sky is one more, with {shown:,}" if shown else ""
     return f"{blocks} with {total:,} photographs in all, {times} the scene's {plan.photographs:,}{sky}"
 
 
@@ -74,7 +76,7 @@ def plan_svg(plan: BlockPlan, cameras: Mapping[str, Float64]) -> str:
     ]
     bottom = height + 2 * PICTURE_EDGE_PX
     counts = Counter(min(times[name], 3) for name in cameras)
-    known = ("in no block", "in 1 block", "in 2 blocks", "in 3 or more blocks")
+    known = ("in no block of the ground", "in 1 block", "in 2 blocks", "in 3 or more blocks")
     legend = [(PLAN_CAMERA_COLOURS[key], f"{counts[key]:,} cameras {known[key]}") for key in range(4) if counts[key]]
     lines = [_text(plan_total(plan), PICTURE_EDGE_PX, bottom)]
     for number, (colour, text) in enumerate(legend, 1):

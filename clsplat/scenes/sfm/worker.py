@@ -26,7 +26,7 @@ import pycolmap
 
 from clsplat.scenes.sfm import focal_lengths
 from clsplat.scenes.sfm.pipeline import aliked, mapping, matching
-from clsplat.scenes.sfm.pipeline.database import feature_evidence, keep_largest, renumber_by_name
+from clsplat.scenes.sfm.pipeline.database import feature_evidence, keep_largest, renumber_by_name, write_cameras
 from clsplat.scenes.sfm.pipeline.features import extract_sift
 from clsplat.scenes.sfm.pipeline.photo_pairs import MAX_EXHAUSTIVE_PHOTOS, Pair, joined
 from clsplat.scenes.sfm.worker_progress import UNDISTORTED_IMAGES
@@ -74,6 +74,7 @@ class Worker:
         self.database = self.work / "database.db"
         self.count = sum(map(len, task["groups"]))
         self.placed, self.by_gps = 0, False
+        self.without_focal: list[pycolmap.Camera] = []
         self.seconds: dict[str, dict[str, float]] = {}
         self._stage, self._began = "", (0.0, 0.0)
 
@@ -225,6 +226,7 @@ class Worker:
     def solve_at_once(self) -> mapping.Models:
         """Recover models by global mapping."""
         self.begin("cameras at once", None)
+        write_cameras(self.database, self.without_focal)
         return mapping.global_models(
             self.database,
             self.photos,
@@ -248,7 +250,7 @@ class Worker:
     def add_one_by_one(self, *, relaxed: bool) -> mapping.Models:
         """Recover models by incremental mapping. relaxed: as in `mapping.incremental_models`."""
         self.begin("cameras again" if relaxed else "cameras", self.count)
-        matching.find_focal_lengths(self.database)
+        self.without_focal = matching.find_focal_lengths(self.database)
         self.placed = 2
         return mapping.incremental_models(
             self.database,

@@ -61,12 +61,14 @@ def _frozen(bench: CaseBench) -> list[Inputs]:
     axes = np.array([[0.75, 0.5, 0.0], [0.0, 0.25, 0.5]])
     region = TrainedRegion(axes, np.full(2, -np.inf), np.full(2, np.inf))
     low, high = np.quantile(region.coordinates(gaussians.means), (0.2, 0.8), axis=0)
+    near = replace(region, centre=np.array([0.25, -0.5, 4.0]))
+    nearest, farthest = np.sqrt(np.quantile(near.squares(gaussians.means), (0.1, 0.9)).astype(np.float64))
     return [
         Inputs(
             gaussians=gaussians,
             camera=bench.camera,
             explore=Exploration(opacity=0.3125, scale=0.6875),
-            region=replace(region, low=low, high=high),
+            region=replace(near, low=low, high=high, nearest=float(nearest), farthest=float(farthest)),
             slots=evenly(47, (count, FIELDS.floats), -0.5, 0.5).astype(np.float32),
             sparse=False,
         )

@@ -7,6 +7,7 @@ import contextlib
 import sqlite3
 import statistics
 from collections.abc import Iterator, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -194,13 +195,19 @@ def fundamental_matrices(database: Path, camera: int) -> NDArray[np.float64]:
     return np.array(found).reshape(-1, 3, 3)
 
 
-def write_focal_length(database: Path, camera: pycolmap.Camera, focal: float) -> None:
-    """Write the focal length in pixels of a camera as known."""
+def with_focal_length(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
+    """Return the camera with a known focal length in pixels."""
+    found, params = copy(camera), np.array(camera.params)
+    params[camera.focal_length_idxs()] = focal
+    found.params, found.has_prior_focal_length = params, True
+    return found
+
+
+def write_cameras(database: Path, cameras: Sequence[pycolmap.Camera]) -> None:
+    """Write cameras in place of those with the same numbers."""
     with pycolmap.Database.open(database) as opened:
-        params = np.array(camera.params)
-        params[camera.focal_length_idxs()] = focal
-        camera.params, camera.has_prior_focal_length = params, True
-        opened.update_camera(camera)
+        for camera in cameras:
+            opened.update_camera(camera)
 
 
 def gps_positions(database: Path, ids: Sequence[int]) -> NDArray[np.float64]:

@@ -158,14 +158,19 @@ def match_features(database: Path, pairs: Sequence[Pair], *, threads: int, seed:
     sfm_database.rename_images(database, names)
 
 
-def find_focal_lengths(database: Path) -> None:
-    """Write the focal lengths of cameras without EXIF to the database, where the matched pairs tell them.
+def find_focal_lengths(database: Path) -> list[pycolmap.Camera]:
+    """Write the focal lengths of cameras without EXIF to the database, where the matched pairs tell them. Returns these
+    cameras as they were, for the global mapper, which finds focal lengths by itself and keeps known ones.
 
     The incremental mapper tries many pairs to begin with, which takes longer without a focal length. In bonsai_photos
     it began with a pair whose lens it found so wrongly that no third photograph followed, and searched again.
     """
+    before, found = [], []
     for camera in sfm_database.cameras_without_focal_length(database):
         matrices = sfm_database.fundamental_matrices(database, camera.camera_id)
         focal = focal_from_pairs(matrices, camera.width, camera.height)
         if focal is not None:
-            sfm_database.write_focal_length(database, camera, focal)
+            before.append(camera)
+            found.append(sfm_database.with_focal_length(camera, focal))
+    sfm_database.write_cameras(database, found)
+    return before
