@@ -24,6 +24,8 @@ MAX_PAGE_SIDE_PX = MAX_VIDEO_SIDE_PX
 """Maximum side in pixels of a page and its pictures: the limit of videos, as a recorded path may become one."""
 DEFAULT_FOV_Y_RADIANS = math.radians(60)
 """Vertical field of view in radians if no camera of the scene defines it."""
+SAME_FOV = 1e-6
+"""Relative difference up to which fields of view count as equal: browsers convert them between degrees and radians."""
 MAX_START_FOV_Y_RADIANS = math.radians(120)
 """Maximum vertical field of view in radians at the start of a narrow page. More would mainly add space above and below
 the model."""
@@ -119,6 +121,17 @@ class OpeningView:
         It is `fov`, or more on a narrow page, such as on an upright phone, to show the whole width.
         """
         return wide_enough(self.fov, self.aspect, width, height)
+
+    def misfits(self, fov: float, fitted: float, width: int, height: int) -> bool:
+        """Return True if a page of this size should get the field of view of `fov_on`.
+
+        fov: the page's vertical field of view in radians.
+        fitted: the one that it was given last.
+        A page with another field of view than `fitted` and the start's own shows a camera that was clicked, and keeps
+        it. A busy browser may apply the start's own after the fitted one.
+        """
+        own = any(math.isclose(fov, known, rel_tol=SAME_FOV) for known in (self.fov, fitted))
+        return own and min(width, height) > 0 and not math.isclose(fov, self.fov_on(width, height), rel_tol=SAME_FOV)
 
 
 def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:

@@ -15,7 +15,6 @@ import http
 import io
 import ipaddress
 import logging
-import math
 import os
 import re
 import socket
@@ -125,15 +124,13 @@ class Server:
 
         async def came(client: Any) -> None:
             viewer = viewers[client.client_id] = ViserPage(client, viewing, world, address.paths).viewer
-            fov, before = start.fov, (0, 0)
+            fov = start.fov
 
             async def moved(camera: Any) -> None:
-                nonlocal fov, before
+                nonlocal fov
                 size = (camera.image_width, camera.image_height)
-                # fit the start's field of view to a resized page, but keep the field of view of a clicked camera
-                if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
+                if start.misfits(camera.fov, fov, *size):
                     fov = camera.fov = start.fov_on(*size)
-                before = size
                 pose = read_pose(camera.wxyz, camera.position, camera.fov, size, world.origin)
                 if pose is not None:
                     viewing.moved(viewer, pose)

@@ -119,6 +119,19 @@ def test_an_upright_page_shows_what_the_first_photograph_does(size: tuple[int, i
     assert start.fov_on(first.width, first.height) == start.fov == start.fov_on(1920, 300)
 
 
+def test_a_page_that_takes_the_start_late_gets_its_field_of_view_again() -> None:
+    """And after each change of its size, unless it shows a camera that was clicked."""
+    start = start_of(cameras(), np.zeros((0, 3)))
+    fitted, turned = start.fov_on(390, 844), start.fov_on(844, 390)
+    assert fitted > start.fov == turned
+    assert start.misfits(start.fov, start.fov, 390, 844), "a new page"
+    assert start.misfits(start.fov, fitted, 390, 844), "the start's own came after the fitted one"
+    assert not start.misfits(fitted * (1 + 1e-9), fitted, 390, 844)
+    assert start.misfits(fitted, fitted, 844, 390)
+    assert not start.misfits(0.9 * fitted, fitted, 390, 844), "of a clicked camera"
+    assert not start.misfits(start.fov, start.fov, 0, 844), "a page without a size yet"
+
+
 def test_an_upright_page_shows_all_of_a_model_without_cameras() -> None:
     points = np.random.default_rng(0).normal(size=(5000, 3))
     start = start_of([], points)
