@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from broken_kernels import BROKEN
 from calls import Capture, printed, raising, refuses, warned
 from drivers import KEPT
 from pipeline import DEFAULT, shaped
@@ -41,81 +42,6 @@ from clsplat.selftest.result import (
 )
 from clsplat.selftest.scenes import keys, scenes
 from clsplat.selftest.worker import DEFAULT_DEFINES, run
-
-BROKEN = {
-    "arithmetic: x / y": ("x * y", "arithmetic"),
-    "project: -(p.sxy / p.syy)": ("(p.sxy / p.syy)", "project"),
-    "project: tile_counts[i] = count": ("tile_counts[i] = count + 1", "project"),
-    "duplicate: gaussian_from_visible[order[rank]]": ("gaussian_from_visible[rank]", "duplicate"),
-    "duplicate: ty * tiles_x + tx": ("tx * tiles_x + ty", "duplicate"),
-    "sort_radix: & (digits - 1)": ("& (digits - 2)", "sort"),
-    "ranges: = i + 1;": ("= i;", "ranges"),
-    "append: a.y > b.y": ("a.y < b.y", "append"),
-    "append: slot + (tx - x0)": ("slot + (x1 - tx)", "append"),
-    "blend: before * alpha": ("before + alpha", "blend"),
-    "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
-    "target: pixel[4] > 0": ("pixel[4] >= 0", "masks"),
-    "alpha_loss: -scale : (": ("scale : (", "masks"),
-    "depth_loss: nearness[at] - aims[at]": ("nearness[at] + aims[at]", "depth"),
-    "depth_loss: -factor * weight": ("factor * weight", "depth"),
-    "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
-    "blend_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "blend_grad"),
-    "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
-    "features: 2.0f * fma1(v[axis], v[next], w * v[last])": ("2.0f * fma1(v[axis], v[next], -w * v[last])", "features"),
-    "features: (rest - splat[SPLAT_SUB_X])": ("(rest + splat[SPLAT_SUB_X])", "features"),
-    "channels: sums[field][cell] / by": ("sums[field][cell] * by", "channels"),
-    "channels: weight > largest[cell]": ("weight < largest[cell]", "channels"),
-    "channels: MASKL(left <= 0.5f)": ("MASKL(left <= 0.25f)", "channels"),
-    "channels: MASKL(count[cell] == 0)": ("MASKL(count[cell] == 1)", "channels"),
-    "deep: -now - after > slack": ("now - after > slack", "deep"),
-    "deep: left * alpha": ("left + alpha", "deep"),
-    "deep: to[plane * DEEP_ALPHA] = 1.0f -": ("to[plane * DEEP_ALPHA] =", "deep"),
-    "deep_merge: depth[other] < depth[p]": ("depth[other] > depth[p]", "deep_merge"),
-    "deep_merge: -t[p], at[plane * DEEP_ALPHA]": ("t[p], at[plane * DEEP_ALPHA]", "deep_merge"),
-    "deep_merge: 1.0f - after / first": ("after / first", "deep_merge"),
-    "holdout: before * alpha * through": ("before * alpha", "holdout"),
-    "holdout: depth - surface[HELD_Z]": ("surface[HELD_Z] - depth", "holdout"),
-    "project_rays: l22 * t.e2[0]": ("l11 * t.e2[0]", "rays"),
-    "project_rays: latitude - cap": ("latitude + cap", "rays"),
-    "project_rays: -(s * around) / fx": ("(s * around) / fx", "rays"),
-    "project_grad: opacity_weight * opacity": ("opacity_weight + opacity", "penalties"),
-    "noise: * s * s * by": ("* s * by", "noise"),
-    "project_grad: + mean[1] * y) + mean[2] * z": ("+ mean[1] * y) - mean[2] * z", "region"),
-    "project_grad: nearest2 <= square": ("nearest2 > square", "region"),
-    "adam: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
-    "project_grad: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
-    "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),
-    "density: stays && wanted && !large": ("stays && wanted && large", "statistics"),
-    "exposure: by_colour[c], sums[c])": ("by_colour[c], by_colour[c])", "exposure"),
-    "exposure: colour[c] /= gain[c]": ("colour[c] *= gain[c]", "exposure"),
-    "appearance: moved[i] - (float)entries * sum": ("moved[i] + (float)entries * sum", "exposure"),
-    "appearance: (c < 3 ? rate : slow * rate)": ("rate", "ppisp"),
-    "ppisp: (floatL)(mix[1]), r - b": ("(floatL)(mix[1]), b - r", "ppisp"),
-    "ppisp: (float)x + 0.5f": ("(float)x", "ppisp"),
-    "ppisp: fmaL(s2 * s, brighter": ("fmaL(s2, brighter", "ppisp"),
-    "pose: uy * by[2] - uz * by[1]": ("uy * by[2] + uz * by[1]", "pose"),
-    "pose: 0.5f * (fma1(q[0], g[3]": ("0.25f * (fma1(q[0], g[3]", "pose"),
-    "pose: own[k] += by_lens[4 * i + k]": ("own[k] -= by_lens[4 * i + k]", "lens"),
-    "project_grad: lens[2].all = d_mx": ("lens[2].all = d_my", "lens"),
-    "grid: risen[k] = b - a": ("risen[k] = a - b", "grid"),
-    "grid: h * (level - (float)l)": ("h * level", "grid"),
-    "bounds: found[6] = fmax(": ("found[6] = fmin(", "bounds"),
-    "project: ((long)chunks[place] - place)": ("0", "chunks"),
-    "project_grad: ((long)chunks[place] - place)": ("0", "chunks"),
-    "density: ((long)chunks[place] - place)": ("0", "chunks"),
-    "catch_up: p = p - movement(": ("p = p + movement(", "catch_up"),
-    "chunk_records: slots[entry] * (block / 4)": ("entry * (block / 4)", "chunk_records"),
-    "chunk_records: offset / 4 + within": ("within", "chunk_records"),
-    "ewa: field[4].all = -p.sxy / p.det": ("field[4].all = p.sxy / p.det", "ewa"),
-    "ewa_grad: uv = -2.0f * (l22 * g_v)": ("uv = 2.0f * (l22 * g_v)", "ewa"),
-    "sums: four.lo + four.hi": ("four.lo - four.hi", "ewa"),
-    "harmonics_grad: fmaL(-along, d.v[k]": ("fmaL(along, d.v[k]", "harmonics"),
-    "splats: sqrt(det / a)": ("sqrt(det * a)", "splats"),
-    "values: fmaL(weight, (floatL)(own[k]), sums[k])": ("fmaL(alpha, (floatL)(own[k]), sums[k])", "values"),
-    "values_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "values"),
-}
-"""What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
-
 
 UNIONS = {"TRAINING_STAGES", "SELFTEST_STAGES", "INDEX_STAGES"}
 """Groups of stages that share some with the others."""

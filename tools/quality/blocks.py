@@ -220,8 +220,8 @@ def blocks(given: Namespace) -> Rows:
     )
     cells, sky = sum(len(block.photographs) for block in plan.cells), sum(b.iterations for b in plan.blocks if b.is_sky)
     passes = sum(block.iterations for block in plan.cells) / cells
-    yield f"photographs of all blocks / of the scene: {cells / len(scene.train_views):.2f}"
-    yield f"steps of the sky, in photographs of as many passes: {sky / passes / len(scene.train_views):.2f}"
+    yield f"photographs of the blocks without the sky / of the scene: {cells / len(scene.train_views):.2f}"
+    yield f"steps of the sky / of as many passes through the scene: {sky / passes / len(scene.train_views):.2f}"
     yield "model", "Gaussians", "PSNR, dB", "band", "elsewhere", "band less elsewhere"
     everything = {"whole": done.model, **models}
     ground = ground_of(renderer, done.model, scene.test_views, plan)

@@ -36,10 +36,15 @@ MIN_SKY_SHARE = 0.05
 """A photograph shows the sky if the sky fills at least this fraction of the pixels that all Gaussians fill."""
 
 
+MIN_CAMERA_PLACES = 2
+"""Least number of different camera positions of a block."""
+
+
 @dataclass(frozen=True, eq=False)
 class SkyLoads:
     """The part of the coarse model that is the sky, and the photographs that show it.
 
+    sphere: where the sky begins.
     rows: (N,), True for the coarse model's Gaussians in the sky.
     shown: (P,), True for photographs that show it.
     """
@@ -135,11 +140,13 @@ class LoadMeasurement:
 
     @property
     def sky(self) -> SkyLoads | None:
-        """The sky; None if photographs from fewer than two places show it."""
+        """The sky; None if photographs from fewer than MIN_CAMERA_PLACES places show it."""
         shown = self._shown[1] >= MIN_SKY_SHARE
-        if len(np.unique(self.camera_places[shown], axis=0)) < 2:
-            return None
-        return SkyLoads(self._sphere, self._sky_rows, shown)
+        return SkyLoads(self._sphere, self._sky_rows, shown) if self.has_several_places(shown) else None
+
+    def has_several_places(self, photographs: Bool) -> bool:
+        """True if photographs, given as a mask (P,), were taken from at least MIN_CAMERA_PLACES positions."""
+        return len(np.unique(self.camera_places[photographs], axis=0)) >= MIN_CAMERA_PLACES
 
     def of(self, tree: Tree) -> CellLoads:
         """Measure the loads of the cells of a tree. The loads of the last tree are remembered."""

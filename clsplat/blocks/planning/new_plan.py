@@ -30,8 +30,6 @@ from clsplat.runs import scene_record
 from clsplat.runs.run import Run, is_run
 from clsplat.scenes.scene import Scene
 
-MIN_CAMERA_PLACES = 2
-"""Least number of different camera positions of a block."""
 ONE_CAMERA = "one camera"
 """Reason why a cell cannot be trained if all its photographs were taken at one place."""
 MIN_LOAD_DROP = 0.95
@@ -203,9 +201,9 @@ def _note_of_single(measurement: LoadMeasurement, why: str) -> str:
 
 def _unfit(measurement: LoadMeasurement, loads: CellLoads, index: int) -> str:
     """Return in words why a cell cannot be trained; empty if it can."""
-    own = measurement.camera_places[loads.belongs[:, index]]
+    own = loads.belongs[:, index]
     if not loads.inside[index]:
         return "no points"
-    if not len(own):
+    if not own.any():
         return "no photographs"
-    return ONE_CAMERA if len(np.unique(own, axis=0)) < MIN_CAMERA_PLACES else ""
+    return "" if measurement.has_several_places(own) else ONE_CAMERA

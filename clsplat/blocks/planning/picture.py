@@ -39,8 +39,8 @@ def plan_table(plan: BlockPlan) -> list[tuple[str, ...]]:
 
 
 def plan_total(plan: BlockPlan) -> str:
-    """Return a line with the photographs of the ground's blocks together, their ratio to the scene's, and the number
-    of those that show the sky."""
+    """Return a line: how many photographs the ground's blocks have together, their ratio to the scene's photographs,
+    and how many the sky has."""
     total = sum(len(block.photographs) for block in plan.cells)
     blocks = "1 block" if len(plan.cells) == 1 else f"{len(plan.cells):,} blocks"
     times = f"{total / max(plan.photographs, 1):.2f} times"

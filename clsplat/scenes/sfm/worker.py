@@ -18,7 +18,6 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -183,8 +182,14 @@ class Worker:
         which, total = "more " if before else "", before + len(pairs)
         if self.task["features"] == "aliked":
             self.begin(f"{which}learned matches", total)
-            learned = partial(aliked.match_aliked, done=lambda done: self.say(done=before + done))
-            learned(self.database, pairs, threads=threads, seed=seed, with_focal=first)
+            aliked.match_aliked(
+                self.database,
+                pairs,
+                threads=threads,
+                seed=seed,
+                with_focal=first,
+                done=lambda done: self.say(done=before + done),
+            )
         else:
             self.begin(f"{which}matches", total)  # the parent counts the pairs in the database
             matching.match_features(self.database, pairs, threads=threads, seed=seed, with_focal=first)

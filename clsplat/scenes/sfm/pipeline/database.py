@@ -182,7 +182,9 @@ def fundamental_matrices(database: Path, camera: int) -> NDArray[np.float64]:
     """Return the fundamental matrices (N, 3, 3) of the pairs of photographs of one camera, except planar pairs."""
     uncalibrated = int(pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)
     with contextlib.closing(sqlite3.connect(database)) as connection:
-        images = dict(connection.execute("SELECT image_id, 1 FROM images WHERE camera_id = ?", (camera,)).fetchall())
+        images = {
+            image for (image,) in connection.execute("SELECT image_id FROM images WHERE camera_id = ?", (camera,))
+        }
         rows = connection.execute(
             "SELECT pair_id, F FROM two_view_geometries WHERE config = ? AND F IS NOT NULL ORDER BY pair_id",
             (uncalibrated,),
@@ -190,7 +192,7 @@ def fundamental_matrices(database: Path, camera: int) -> NDArray[np.float64]:
         found = [
             np.frombuffer(data).reshape(3, 3)
             for pair, data in rows
-            if all(image in images for image in pycolmap.pair_id_to_image_pair(pair))
+            if images.issuperset(pycolmap.pair_id_to_image_pair(pair))
         ]
     return np.array(found).reshape(-1, 3, 3)
 
