@@ -13,7 +13,9 @@ from scipy import ndimage
 from clsplat.scenes.video.choice import (
     MAX_DEFAULT_FRAMES,
     MOTION_PER_FRAME,
+    SMOOTH_SHARPNESS,
     alike,
+    blurred_frames,
     choose,
     default_count,
     fast_frames,
@@ -147,6 +149,31 @@ def test_no_two_alike_and_no_damaged_or_blurred_frame() -> None:
     assert set(chosen.frames) & set(range(40, 50)) == {45}  # the sharpest of ten alike ones
     assert alike(measured.thumbnails[40], measured.thumbnails[41])
     assert not alike(measured.thumbnails[40], measured.thumbnails[39])
+
+
+def test_detail_that_changes_with_the_view_is_no_blur() -> None:
+    """It doubles in eight seconds, halves again, and then stays. Only frames below both neighbours are blurred."""
+    views = np.concatenate([np.geomspace(0.1, 0.2, 80), np.geomspace(0.2, 0.1, 80), np.full(80, 0.1)])
+    sharpness = views + SMOOTH_SHARPNESS
+    assert not blurred_frames(made([0.02] * 240, sharpness.tolist())).any()
+    sharpness[[40, 100, 200]] -= 0.15 * views[[40, 100, 200]]
+    assert np.flatnonzero(blurred_frames(made([0.02] * 240, sharpness.tolist()))).tolist() == [40, 100, 200]
+
+
+def test_sharp_frames_beside_a_shaken_part_take_its_place() -> None:
+    """A hand shakes for 0.6 s, again and again. These frames lack a fifth of their detail."""
+    sharpness = np.full(150, 0.35)
+    for begin in range(10, 140, 15):
+        sharpness[begin : begin + 6] -= 0.02
+    measured = made(np.random.default_rng(4).uniform(0.01, 0.03, 150).tolist(), sharpness.tolist())
+    shaken = np.flatnonzero(sharpness < 0.34)
+    assert blurred_frames(measured)[shaken].all()
+    chosen = choose(measured, 40)
+    assert 38 <= len(chosen.frames) <= 40, "a division that gives 40 need not exist"
+    assert not set(chosen.frames) & set(shaken)
+    assert len(np.unique(chosen.stretches[chosen.frames])) == len(chosen.frames), "one of each stretch"
+    few = choose(measured, 100)
+    assert len(few.frames) == 150 - len(shaken), "all that are sharp, where more are asked for"
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9, 10, 11, 200])

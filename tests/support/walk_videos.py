@@ -49,8 +49,15 @@ class Walk:
     fps: int
 
 
-def walk(width: int, height: int, count: int, fps: int = 10, sub_frames: int = 3, seed: int = 0) -> Walk:
-    """Render a walk of `count` frames. sub_frames: pictures that are averaged for a frame of a moving camera."""
+def walk(
+    width: int, height: int, count: int, *, fps: int = 10, sub_frames: int = 3, samples: int = 1, seed: int = 0
+) -> Walk:
+    """Render a walk of `count` frames.
+
+    sub_frames: pictures that are averaged for a frame of a moving camera; an odd number.
+    samples: each pixel of a picture is the average of samples x samples rays. 2 is what `demo` has; with 1, frames are
+    aliased.
+    """
     surfaces = baked_still_life()
     rng = np.random.default_rng(seed)
     frames: list[NDArray[np.float32]] = []
@@ -64,7 +71,7 @@ def walk(width: int, height: int, count: int, fps: int = 10, sub_frames: int = 3
             for open_ in (np.arange(sub_frames) + 0.5) / sub_frames - 0.5
         ]
         used = shots if part != "stop" else shots[sub_frames // 2 :][:1]
-        pictures = [ray_caster.render(surfaces, shot, 1) for shot in used]
+        pictures = [ray_caster.render(surfaces, shot, samples) for shot in used]
         frames.append(np.asarray(np.mean(pictures, axis=0), np.float32))
         parts.append(part)
         cameras.append(shots[sub_frames // 2])

@@ -27,9 +27,14 @@ has about 1.4."""
 FAST_RATIO = 3.0
 """A camera is too fast if its motion is above this multiple of its median while it moves, and above
 FAST_SIDES_PER_SECOND."""
+MAX_STRETCHES_PER_FRAME = 4
+"""Largest number of stretches of equal motion for each frame that is asked for, where some have no usable frame."""
 BLURRED_RATIO = 0.6
 """A frame is blurred if its detail (sharpness minus SMOOTH_SHARPNESS) is below this fraction of the upper quartile of
 its neighbours' detail."""
+LESS_SHARP_RATIO = 0.9
+"""A frame is blurred too if its detail is below this fraction of the upper quartile of the neighbours before it, and of
+those after it. Where detail only rises or falls, because of what the camera sees, one of the two is no larger."""
 NEIGHBOUR_SECONDS = 1.0
 """A frame's neighbours are the frames up to this many seconds before and after it."""
 MAX_ALIKE_RMS_LEVELS, MAX_ALIKE_RMS_PER_GRADIENT = 1.0, 0.2
@@ -65,25 +70,38 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
     The camera's path is divided into `count` stretches of equal motion, so that a camera that stands still gives one
     frame. If at most `count` frames are usable, each frame is a stretch. The sharpest frame of each stretch is chosen,
     or the sharpest in the stretch's middle half if it is sharper than the stretch's median. Fast, blurred and damaged
-    frames are not usable. Of two alike frames in a row, the less sharp one is left out.
+    frames are not usable. Where a stretch has no usable frame, there are more and shorter stretches, up to
+    MAX_STRETCHES_PER_FRAME for each frame, so that the number of frames comes as near to `count` as it can without
+    exceeding it. Of two alike frames in a row, the less sharp one is left out.
     """
     fast, blurred = fast_frames(measured), blurred_frames(measured)
     path = travelled(measured, fast)
     total = float(path[-1])
     wanted = count if count is not None else default_count(total, measured.seconds[-1], len(measured))
     usable = measured.whole & ~fast & ~blurred
-    if wanted >= usable.sum():
-        stretches = np.arange(len(measured))
-    else:
-        stretches = np.minimum((path / max(total, 1e-9) * wanted).astype(np.int64), wanted - 1)
-    stretches[fast] = -1
-    chosen = []
-    for number in np.unique(stretches[~fast]):
-        inside = np.flatnonzero(stretches == number)
-        if (best := _sharpest(measured.sharpness, path, inside, usable)) is not None:
-            chosen.append(best)
-    kept = np.array(unlike(chosen, measured), np.int64)
-    return Choice(kept, stretches, fast, blurred, total, wanted)
+
+    def divided(number: int) -> Choice:
+        """The choice of a frame of each of `number` stretches, or of each frame as a stretch if few are usable."""
+        if wanted >= usable.sum():
+            stretches = np.arange(len(measured))
+        else:
+            stretches = np.minimum((path / max(total, 1e-9) * number).astype(np.int64), number - 1)
+        stretches[fast] = -1
+        parts = (np.flatnonzero(stretches == part) for part in np.unique(stretches[~fast]))
+        best = (_sharpest(measured.sharpness, path, part, usable) for part in parts)
+        kept = unlike([frame for frame in best if frame is not None], measured)
+        return Choice(np.array(kept, np.int64), stretches, fast, blurred, total, wanted)
+
+    fewest, most = wanted, MAX_STRETCHES_PER_FRAME * wanted
+    choice = divided(fewest)
+    while most - fewest > 1 and len(choice.frames) < wanted < usable.sum():
+        middle = (fewest + most) // 2
+        tried = divided(middle)
+        if len(tried.frames) <= wanted:
+            fewest, choice = middle, tried
+        else:
+            most = middle
+    return choice
 
 
 def default_count(total: float, seconds: float, frames: int) -> int:
@@ -117,11 +135,20 @@ def fast_frames(measured: Measurements) -> NDArray[np.bool_]:
 
 def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
     """Return a mask (F,) of the frames that are much less sharp than those within NEIGHBOUR_SECONDS."""
-    detail = measured.sharpness - SMOOTH_SHARPNESS
-    first = np.searchsorted(measured.seconds, measured.seconds - NEIGHBOUR_SECONDS)
-    last = np.searchsorted(measured.seconds, measured.seconds + NEIGHBOUR_SECONDS, side="right")
-    around = np.array([np.quantile(detail[low:high], 0.75) for low, high in zip(first, last, strict=True)])
-    return np.asarray(detail < BLURRED_RATIO * around)
+    detail, at = measured.sharpness - SMOOTH_SHARPNESS, measured.seconds
+
+    def usual(begin: Float64, end: Float64) -> Float64:
+        """Upper quartile (F,) of the detail of the frames between two times (F,); 0 if there are none."""
+        first, last = np.searchsorted(at, begin), np.searchsorted(at, end, side="right")
+        parts = (detail[low:high] for low, high in zip(first, last, strict=True))
+        return np.array([np.quantile(part, 0.75) if len(part) else 0.0 for part in parts])
+
+    around = usual(at - NEIGHBOUR_SECONDS, at + NEIGHBOUR_SECONDS)
+    before, after = (
+        usual(at - NEIGHBOUR_SECONDS, np.nextafter(at, -np.inf)),
+        usual(np.nextafter(at, np.inf), at + NEIGHBOUR_SECONDS),
+    )
+    return np.asarray(detail < np.maximum(BLURRED_RATIO * around, LESS_SHARP_RATIO * np.minimum(before, after)))
 
 
 def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:

@@ -31,7 +31,7 @@ from clsplat.scenes.video.reading import VideoFacts, VideoFrame, VideoReader, op
 
 FRAME_TABLE_FILE = "frames.json"
 """File beside the frames with their names, times and measurements, and the videos' facts."""
-FRAME_TABLE_VERSION = 1
+FRAME_TABLE_VERSION = 2
 """Version of the table and of the choice of frames. Frames of another version are not used again."""
 FRAME_JPEG_QUALITY = 97
 """JPEG quality of the frames. Their chroma is not subsampled."""
