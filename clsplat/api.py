@@ -21,6 +21,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.training.loop import Between, StepReport, TrainingSession
 from clsplat.training.memory import HostMemory
 from clsplat.training.preparation import begin, check_scene, settings_of
+from clsplat.training.region_pixels import with_region_pixels
 from clsplat.training.start import NO_START, Start, check_start
 from clsplat.training.trainer import Trainer
 
@@ -118,6 +119,7 @@ def train(
         memory = HostMemory.chosen(max_host_mem, cache, run, scratch)
         memory.remove_scratch()
         scene = begin(scene, config, run, resume=resume, start=start)
+        scene = with_region_pixels(scene, start, first, config.rasterizer)
         trainer = Trainer(scene, config, first, start, further=further, memory=memory)
         with closing(trainer):
             session = TrainingSession(trainer, run, on_step, on_plan)

@@ -290,7 +290,7 @@ class MemoryPlanner:
             fields=slot_fields(needs, nearness=bool(self._config.depth_use)),
             photographs=sum(view.camera.width * view.camera.height for view in self._scene.train_views),
             turns=turns,
-            masks=self._config.mask_use != NO_MASKS,
+            masks=self._config.mask_use != NO_MASKS or any(view.ignores for view in self._scene.views),
             row_bytes=sum(component.row_bytes for component in components),
             pixel_bytes=sum(component.pixel_bytes for component in components),
             by_chunk=by_chunk,

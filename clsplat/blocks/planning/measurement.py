@@ -178,7 +178,7 @@ class LoadMeasurement:
             (self.config.sh_degree + 1) ** 2,
             [view.camera for view in self.scene.train_views],
             self.config.rasterizer,
-            StepMemory(SlotFields(contributions=density.min_contribution > 0)),
+            StepMemory(SlotFields(contributions=density.min_contribution > 0), masks=True),
         )
         return need.total
 

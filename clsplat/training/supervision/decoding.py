@@ -108,14 +108,15 @@ class Decoder:
         bent = (camera.projection, [float(value) for value in camera.radial])
         mask = None if view.mask is None else asdict(view.mask.use)
         files = [str(Path(path).absolute()) for path in view.files]
-        return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, self.rounds, size))
+        kept = None if view.kept is None else asdict(view.kept)
+        return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, kept, self.rounds, size))
 
     def largest(self) -> int:
         """Upper limit of the bytes that any view's pixels take at full size."""
         return max(
             view.camera.width
             * view.camera.height
-            * (5 if view.mask is not None and view.mask.ignores else 4)
+            * (5 if view.ignores else 4)
             * (1 if self.rounds and view.path.suffix.lower() not in HDR_SUFFIXES else 4)
             for view in self.views
         )
