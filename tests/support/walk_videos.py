@@ -33,8 +33,10 @@ TURN_RADIANS = 0.6 * np.pi
 """Angle of the fast turn, to the side and back."""
 HAND_METRES = 0.0015
 """Standard deviation of the hand's movements at rest."""
-SHAKE_RADIANS = 0.02
-"""Largest change of the direction of view while the shutter of a frame is open; each frame has its own."""
+SHAKE_RADIANS_PER_SECOND = 0.4
+"""Largest speed at which the direction of view changes while the shutter is open. Each frame has its own.
+
+The shutter is open for half of the time between frames."""
 TKHD_MATRIX_AT = 40
 """Place of the matrix after the header of version 0 of a `tkhd` box of MP4."""
 
@@ -64,7 +66,7 @@ def walk(
     parts: list[Part] = []
     cameras: list[Camera] = []
     for part, angle, yaw, speed in _path(count):
-        shake = rng.uniform(0, SHAKE_RADIANS) * (part != "stop")
+        shake = rng.uniform(0, 0.5 / fps * SHAKE_RADIANS_PER_SECOND) * (part != "stop")
         hand = rng.normal(0, HAND_METRES, 3)
         shots = [
             _camera(width, height, angle + open_ * speed[0], yaw + open_ * (speed[1] + shake), hand)

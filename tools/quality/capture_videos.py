@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`clsplat capture` of a video of a camera walk, against still photographs from the same places.
 
-    python tools/quality/capture_videos.py FOLDER [--kinds plain,hlg,turned] [--size 480x270] [--iterations 2000]
+    python tools/quality/capture_videos.py FOLDER [--kinds plain,hlg,turned] [--size 480x270] [--fps 30]
 
 The ray caster renders a walk with stops, a fast turn and motion blur (tests/support/walk_videos.py). The video is
 captured; then a sharp still photograph is rendered for each frame that was taken, and the stills are captured. Prints
@@ -32,9 +32,9 @@ from clsplat.scenes.video.frames import FRAME_TABLE_FILE
 
 MAX_LOSS_DB = 1.0
 """Largest loss of held-out PSNR in dB of a video against still photographs from the same places."""
-SUB_FRAMES = 7
-"""Pictures that are averaged for a frame of a moving camera. The largest shake then moves the picture by about a pixel
-from one to the next at the default size."""
+SUB_FRAMES_PER_EXPOSURE_SECOND = 140
+"""Pictures that are averaged for a frame of a moving camera, for each second that the shutter is open: 7 at 10 frames a
+second, 3 at 30. The largest shake then moves the picture by about a pixel from one to the next at the default size."""
 KINDS: dict[str, dict[str, Any]] = {"plain": {}, "hlg": {"hlg": True}, "turned": {"turns": 1}}
 """Arguments of `write_walk` by the kind of video."""
 
@@ -48,6 +48,11 @@ def captured(source: Path, output: Path, *more: str) -> dict[str, Any]:
         raise SystemExit(status)
     result: dict[str, Any] = json.loads((output / "run" / "eval.json").read_text("utf-8"))
     return result
+
+
+def sub_frames_of(fps: int) -> int:
+    """Number of pictures that are averaged for a frame, an odd one."""
+    return int(SUB_FRAMES_PER_EXPOSURE_SECOND * 0.5 / fps) // 2 * 2 + 1
 
 
 def processor_seconds() -> float:
@@ -76,7 +81,8 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kinds", default="plain", help="kinds of videos: plain, hlg, turned; several with commas")
     parser.add_argument("--size", default="480x270", help="size of the video in pixels")
-    parser.add_argument("--length", type=int, default=200, help="length of the video in frames, ten a second")
+    parser.add_argument("--length", type=int, default=20, help="length of the video in seconds")
+    parser.add_argument("--fps", type=int, default=30, help="frames a second of the video")
     parser.add_argument("--frames", default="48", help="number of frames to take from each video")
     parser.add_argument("--iterations", default="2000")
     given = parser.parse_args()
@@ -84,8 +90,9 @@ def main() -> int:
     width, height = map(int, given.size.split("x"))
     kinds = given.kinds.split(",")
     written = all((given.folder / f"{kind}.mp4").exists() for kind in kinds)  # then only the cameras are needed
-    sub_frames, samples = (1, 1) if written else (SUB_FRAMES, 2)
-    made = walk(width, height, given.length, sub_frames=sub_frames, samples=samples)
+    sub_frames, samples = (1, 1) if written else (sub_frames_of(given.fps), 2)
+    count = given.fps * given.length
+    made = walk(width, height, count, fps=given.fps, sub_frames=sub_frames, samples=samples)
     head = ("video", "photographs", "video, dB", "stills, dB", "difference", "seconds", "of processors")
     rows, worst = [head], 0.0
     for kind in kinds:
