@@ -21,7 +21,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.training.loop import Between, StepReport, TrainingSession
 from clsplat.training.memory import HostMemory
 from clsplat.training.preparation import begin, check_scene, settings_of
-from clsplat.training.region_pixels import with_region_pixels
+from clsplat.training.region_masks import with_region_masks
 from clsplat.training.start import NO_START, Start, check_start
 from clsplat.training.trainer import Trainer
 
@@ -82,7 +82,8 @@ def train(
         Continue from the run's latest checkpoint. If False, a run that has checkpoints or metrics is refused.
     start : Start
         What to begin with in place of Gaussians from the scene's points: a model, the region in which it is trained,
-        and another run's appearance. To resume, give the same start again.
+        and another run's appearance. With a region, the loss leaves out the pixels that show what is outside, by the
+        model. To resume, give the same start again.
     on_step : callable, optional
         Called with a report every 10 steps (`REPORT_EVERY` in `clsplat/training/loop.py`).
     on_plan : callable, optional
@@ -119,8 +120,8 @@ def train(
         memory = HostMemory.chosen(max_host_mem, cache, run, scratch)
         memory.remove_scratch()
         scene = begin(scene, config, run, resume=resume, start=start)
-        scene = with_region_pixels(scene, start, first, config.rasterizer)
-        trainer = Trainer(scene, config, first, start, further=further, memory=memory)
+        shown = with_region_masks(scene, start, first, config.rasterizer)
+        trainer = Trainer(shown, config, first, start, further=further, memory=memory)
         with closing(trainer):
             session = TrainingSession(trainer, run, on_step, on_plan)
             if resume:

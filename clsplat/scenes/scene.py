@@ -26,8 +26,8 @@ from clsplat.scenes.dataset import SOURCE_FRAME, Lens, SceneFrame, pixels_of, un
 from clsplat.scenes.geography.georeference import Georeference
 from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.supervision.depth_samples import KnownDepth
-from clsplat.scenes.supervision.kept_pixels import KeptPixels
 from clsplat.scenes.supervision.masks import MASK_THRESHOLD, Mask
+from clsplat.scenes.supervision.region_mask import RegionMask
 from clsplat.scenes.thumbnail import Thumbnail, thumbnail_of
 
 Split = Literal["train", "test"]
@@ -68,11 +68,12 @@ class View:
     upright: True if the camera fits the picture after rotation by its EXIF orientation, False if it fits the stored
         picture.
     mask: mask of the pixels that training uses; None if all pixels are used.
-    kept: pixels of the undistorted picture that training uses; None for all that the mask keeps.
     depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
     stamps: size in bytes and modification time in nanoseconds of each of `files` when the scene was loaded; () if
         unknown.
+    region_mask: pixels that show the region of a training; None for all. The training's decoder applies it, in addition
+        to the mask, and `load` does not.
     """
 
     name: str
@@ -82,10 +83,10 @@ class View:
     lens: Lens
     upright: bool = False
     mask: Mask | None = None
-    kept: KeptPixels | None = None
     depth_file: Path | None = None
     depth: KnownDepth | None = None
     stamps: tuple[FileStamp, ...] = ()
+    region_mask: RegionMask | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -121,7 +122,7 @@ class View:
     @property
     def ignores(self) -> bool:
         """True if training may ignore pixels of the photograph."""
-        return self.kept is not None or (self.mask is not None and self.mask.ignores)
+        return self.region_mask is not None or (self.mask is not None and self.mask.ignores)
 
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read like `load`. If a mask leaves pixels out, there is a fifth channel: 1 for kept pixels, else 0.
@@ -136,11 +137,6 @@ class View:
         reduce: resample the picture to the camera's size first, and from this to each size. This is faster; results
         differ by rounding. Pictures with masked pixels are always resampled from the file's size.
         """
-        images = self._resampled(sizes, reduce=reduce)
-        return images if self.kept is None else [self.kept.applied(image) for image in images]
-
-    def _resampled(self, sizes: Sequence[tuple[int, int]], *, reduce: bool) -> list[Float32]:
-        """Read like `load_sizes`, with all pixels that the mask keeps."""
         image, counts = self._read(), None
         if self.mask is not None:
             image, counts = self.mask.applied(image, orient=self.upright)

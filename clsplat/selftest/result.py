@@ -94,13 +94,13 @@ room for GPUs whose divisions and roots do not. If an operation is wrong, result
 def stages_of_training(config: TrainConfig, *, region: bool = False) -> tuple[str, ...]:
     """Return the names of the self-test's stages that training with these settings uses.
 
-    region: True if only the Gaussians of a region are trained.
+    region: True if only the Gaussians of a region are trained. Their pixels are found by channels, and masked.
     """
     return (
         *TRAINING_STAGES,
         *CHUNK_STAGES,
-        *(REGION_STAGES if region else ()),
-        *(() if config.mask_use == NO_MASKS else MASK_STAGES),
+        *((*CHANNEL_STAGES, *REGION_STAGES) if region else ()),
+        *(MASK_STAGES if region or config.mask_use != NO_MASKS else ()),
         *(() if config.appearance == "none" else APPEARANCE_STAGES),
         *(DEPTH_STAGES if config.depth_use else ()),
         *(POSE_STAGES if config.refine_poses else ()),

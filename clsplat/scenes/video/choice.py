@@ -28,13 +28,17 @@ FAST_RATIO = 3.0
 """A camera is too fast if its motion is above this multiple of its median while it moves, and above
 FAST_SIDES_PER_SECOND."""
 MAX_STRETCHES_PER_FRAME = 4
-"""Largest number of stretches of equal motion for each frame that is asked for, where some have no usable frame."""
+"""Largest number of stretches of equal motion, as a multiple of the number of frames that are asked for."""
 BLURRED_RATIO = 0.6
 """A frame is blurred if its detail (sharpness minus SMOOTH_SHARPNESS) is below this fraction of the upper quartile of
 its neighbours' detail."""
-LESS_SHARP_RATIO = 0.9
-"""A frame is blurred too if its detail is below this fraction of the upper quartile of the neighbours before it, and of
-those after it. Where detail only rises or falls, because of what the camera sees, one of the two is no larger."""
+SHAKEN_RATIO = 0.9
+"""A frame is shaken if its detail is below this fraction of the upper quartile of its neighbours' detail, both of those
+before it and of those after it."""
+MIN_NEIGHBOURS = 4
+"""Least number of neighbours before a frame, and after it, with which it is compared for shake."""
+MAX_GAP_STRETCHES = 3.0
+"""Longest part of the camera's path without a chosen frame, in stretches, for which there are shaken frames."""
 NEIGHBOUR_SECONDS = 1.0
 """A frame's neighbours are the frames up to this many seconds before and after it."""
 MAX_ALIKE_RMS_LEVELS, MAX_ALIKE_RMS_PER_GRADIENT = 1.0, 0.2
@@ -68,37 +72,45 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
     """Choose frames of a video. count: number of frames; None for a number by length and motion.
 
     The camera's path is divided into `count` stretches of equal motion, so that a camera that stands still gives one
-    frame. If at most `count` frames are usable, each frame is a stretch. The sharpest frame of each stretch is chosen,
-    or the sharpest in the stretch's middle half if it is sharper than the stretch's median. Fast, blurred and damaged
-    frames are not usable. Where a stretch has no usable frame, there are more and shorter stretches, up to
-    MAX_STRETCHES_PER_FRAME for each frame, so that the number of frames comes as near to `count` as it can without
-    exceeding it. Of two alike frames in a row, the less sharp one is left out.
+    frame. If there are hardly more frames than that, each is a stretch. The sharpest frame of each stretch is chosen,
+    or the sharpest in the stretch's middle half if it is sharper than the stretch's median. Fast, blurred, shaken and
+    damaged frames are not usable, but a shaken frame is chosen rather than none on a part of the path as long as
+    MAX_GAP_STRETCHES. If stretches have no usable frame, the path is divided into more, up to MAX_STRETCHES_PER_FRAME
+    times as many, so that the number of frames comes near to `count`. Of two alike frames in a row, the less sharp one
+    is left out.
     """
     fast, blurred = fast_frames(measured), blurred_frames(measured)
     path = travelled(measured, fast)
     total = float(path[-1])
     wanted = count if count is not None else default_count(total, measured.seconds[-1], len(measured))
-    usable = measured.whole & ~fast & ~blurred
+    able = measured.whole & ~fast & ~blurred
+    usable = able & ~shaken_frames(measured)
 
     def divided(number: int) -> Choice:
-        """The choice of a frame of each of `number` stretches, or of each frame as a stretch if few are usable."""
-        if wanted >= usable.sum():
+        """The choice of a frame of each of `number` stretches, or of each frame as a stretch if there are few."""
+        if wanted >= able.sum():
             stretches = np.arange(len(measured))
         else:
             stretches = np.minimum((path / max(total, 1e-9) * number).astype(np.int64), number - 1)
         stretches[fast] = -1
-        parts = (np.flatnonzero(stretches == part) for part in np.unique(stretches[~fast]))
-        best = (_sharpest(measured.sharpness, path, part, usable) for part in parts)
-        kept = unlike([frame for frame in best if frame is not None], measured)
-        return Choice(np.array(kept, np.int64), stretches, fast, blurred, total, wanted)
+        chosen, last = list[int](), 0.0
+        for inside in _parts(stretches):
+            best = _sharpest(measured.sharpness, path, inside, usable)
+            if best is None and (path[inside[-1]] - last) * wanted > MAX_GAP_STRETCHES * total:
+                best = _sharpest(measured.sharpness, path, inside, able)
+            if best is not None:
+                chosen.append(best)
+                last = float(path[best])
+        return Choice(np.array(unlike(chosen, measured), np.int64), stretches, fast, blurred, total, wanted)
 
-    fewest, most = wanted, MAX_STRETCHES_PER_FRAME * wanted
+    fewest, most = wanted, MAX_STRETCHES_PER_FRAME * wanted + 1
     choice = divided(fewest)
-    while most - fewest > 1 and len(choice.frames) < wanted < usable.sum():
+    while most - fewest > 1 and len(choice.frames) < wanted < able.sum():
         middle = (fewest + most) // 2
         tried = divided(middle)
         if len(tried.frames) <= wanted:
-            fewest, choice = middle, tried
+            fewest = middle
+            choice = max(choice, tried, key=lambda each: len(each.frames))
         else:
             most = middle
     return choice
@@ -134,21 +146,35 @@ def fast_frames(measured: Measurements) -> NDArray[np.bool_]:
 
 
 def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
-    """Return a mask (F,) of the frames that are much less sharp than those within NEIGHBOUR_SECONDS."""
-    detail, at = measured.sharpness - SMOOTH_SHARPNESS, measured.seconds
+    """Return a mask (F,) of the frames that are much less sharp than their neighbours."""
+    detail, first, last = _neighbourhoods(measured)
+    around = np.array([np.quantile(detail[low:high], 0.75) for low, high in zip(first, last, strict=True)])
+    return np.asarray(detail < BLURRED_RATIO * around)
 
-    def usual(begin: Float64, end: Float64) -> Float64:
-        """Upper quartile (F,) of the detail of the frames between two times (F,); 0 if there are none."""
-        first, last = np.searchsorted(at, begin), np.searchsorted(at, end, side="right")
-        parts = (detail[low:high] for low, high in zip(first, last, strict=True))
-        return np.array([np.quantile(part, 0.75) if len(part) else 0.0 for part in parts])
 
-    around = usual(at - NEIGHBOUR_SECONDS, at + NEIGHBOUR_SECONDS)
-    before, after = (
-        usual(at - NEIGHBOUR_SECONDS, np.nextafter(at, -np.inf)),
-        usual(np.nextafter(at, np.inf), at + NEIGHBOUR_SECONDS),
-    )
-    return np.asarray(detail < np.maximum(BLURRED_RATIO * around, LESS_SHARP_RATIO * np.minimum(before, after)))
+def shaken_frames(measured: Measurements) -> NDArray[np.bool_]:
+    """Return a mask (F,) of the frames that are less sharp than their neighbours before and after them.
+
+    Where detail rises or falls with what the camera sees, the neighbours on one side have no more than the frame.
+    Damaged frames are no neighbours. Frames with fewer than MIN_NEIGHBOURS on a side are not in the mask.
+    """
+    detail, first, last = _neighbourhoods(measured)
+
+    def usual(low: int, high: int) -> float:
+        """Upper quartile of the detail of frames [low, high); -infinity if they are too few."""
+        part = detail[low:high][measured.whole[low:high]]
+        return float(np.quantile(part, 0.75)) if len(part) >= MIN_NEIGHBOURS else -np.inf
+
+    sides = enumerate(zip(first, last, strict=True))
+    both = np.array([min(usual(low, index), usual(index + 1, high)) for index, (low, high) in sides])
+    return np.asarray(detail < SHAKEN_RATIO * both)
+
+
+def _neighbourhoods(measured: Measurements) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64]]:
+    """Return each frame's detail (F,), and the first and the end index (F,) of its neighbours and itself."""
+    at = measured.seconds
+    first = np.searchsorted(at, at - NEIGHBOUR_SECONDS)
+    return measured.sharpness - SMOOTH_SHARPNESS, first, np.searchsorted(at, at + NEIGHBOUR_SECONDS, side="right")
 
 
 def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
@@ -172,6 +198,13 @@ def travelled(measured: Measurements, fast: NDArray[np.bool_]) -> Float64:
         else:
             path[index] = path[index - 1]
     return path
+
+
+def _parts(stretches: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the indices of the frames of each stretch, given its number (F,). Negative numbers are left out."""
+    order = np.argsort(stretches, kind="stable")
+    order = order[stretches[order] >= 0]
+    return np.split(order, np.flatnonzero(np.diff(stretches[order])) + 1) if len(order) else []
 
 
 def _sharpest(sharpness: Float64, path: Float64, inside: NDArray[np.int64], usable: NDArray[np.bool_]) -> int | None:

@@ -74,14 +74,19 @@ class Decoder:
         """
         store = self.store
         if store is not None and (found := store.read(self._key(index, factor))) is not None:
-            return {factor: found}
+            return {factor: self._shown(index, found)}
         later = keeps or (store is not None and store.writable)
         wanted = [factor, *(each for each in self.factors if later and each < factor)]
         images = self._decoded(index, wanted)
         if store is not None:
             for each, image in images.items():
                 store.write(self._key(index, each), image)
-        return images if keeps else {factor: images[factor]}
+        return {each: self._shown(index, images[each]) for each in (images if keeps else (factor,))}
+
+    def _shown(self, index: int, image: NDArray[Any]) -> NDArray[Any]:
+        """The pixels of a view, with those left out that do not show the region of the training."""
+        mask = self.views[index].region_mask
+        return image if mask is None else mask.masked(image)
 
     def _decoded(self, index: int, factors: Sequence[float]) -> dict[float, NDArray[Any]]:
         view = self.views[index]
@@ -108,8 +113,7 @@ class Decoder:
         bent = (camera.projection, [float(value) for value in camera.radial])
         mask = None if view.mask is None else asdict(view.mask.use)
         files = [str(Path(path).absolute()) for path in view.files]
-        kept = None if view.kept is None else asdict(view.kept)
-        return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, kept, self.rounds, size))
+        return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, self.rounds, size))
 
     def largest(self) -> int:
         """Upper limit of the bytes that any view's pixels take at full size."""
