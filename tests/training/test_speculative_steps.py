@@ -7,6 +7,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from calls import noted, refuses
+from pipeline import shaped
 from quick import quick
 from same_bytes import assert_alike, stepped
 from tiny import run_steps, short, trained_to
@@ -46,7 +47,7 @@ TOO_SMALL = {
 def test_trained_by_capacity_is_trained_with_exact_counts(
     device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, steps: str
 ) -> None:
-    device = device.with_shape(lanes=1, items=64) if steps == "in groups" else device
+    device = shaped(device, 1, 64) if steps == "in groups" else device
     exact = stepped(scene, CONFIG, device, monkeypatch, capacity=False)
     other = stepped(scene, CONFIG, device, monkeypatch, capacity=True, too_small=TOO_SMALL[steps])
     assert exact[2].pending.redone == 0
