@@ -84,12 +84,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """The quick run has the shape for CPUs, as building kernels for groups of work-items takes long."""
     in_one_order(config, items)
     leave_out(config, items, lambda item: _driver_and_shape(item)[0])
+    by_default = {index: cpu_shape(open_device(str(index))) for index in KEPT}  # once: opening one takes 10 ms
     pairs = {item for item in items if _is_left_out(item)}
     config.hook.pytest_deselected(items=list(pairs))
     items[:] = [item for item in items if item not in pairs]
     for item in items:
         index, shape = _driver_and_shape(item)
-        if shape is not None and shape != cpu_shape(open_device(str(index))):
+        if shape is not None and shape != by_default[index]:
             item.add_marker(pytest.mark.slow)
         for marker in item.iter_markers("needs"):
             if reason := missing(*marker.args):

@@ -15,6 +15,7 @@ from calls import Capture, printed, rejected
 from clsplat.bench import stages
 from clsplat.cli.selftest import times
 from clsplat.demo import measured_view
+from clsplat.device.context import Device
 from clsplat.device.drivers import diagnostics
 from clsplat.device.selection import list_devices
 from clsplat.errors import CapacityError
@@ -46,9 +47,9 @@ def test_variables_are_shown(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
+def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture, default_device: Device) -> None:
     file = tmp_path / "report.json"
-    assert f"Wrote {file}." in printed(capsys, ["selftest", "--device", "0", "--report", file]).out
+    assert f"Wrote {file}." in printed(capsys, ["selftest", "--device", default_device.index, "--report", file]).out
     report: dict[str, Any] = json.loads(file.read_text())
     (device,) = report["devices"]
     assert device["trusted"]

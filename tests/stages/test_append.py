@@ -89,6 +89,7 @@ def assert_same_lists(one: list[NDArray[np.uint32]], other: list[NDArray[np.uint
         assert_same_bits(got, wanted)
 
 
+@pytest.mark.slow
 def test_lists_are_the_radix_sort_s(device: Device) -> None:
     """Of random scenes, among them equal depths, boxes of all tiles and empty lists; the same in every run."""
     grouped = shaped(device, 1, GROUP_ITEMS)

@@ -97,6 +97,15 @@ def test_nothing_of_ours_gets_into_a_machine(tmp_path: Path, monkeypatch: pytest
     assert environment["HOME"] == str(tmp_path / "home")
 
 
+def test_only_machines_with_other_texts_load_built_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = machines.BUILT_KERNELS
+    monkeypatch.setenv(name, "/built")
+    folders = {key: environment_of(row, tmp_path).get(name) for key, row in rows().items()}
+    assert {key: folder for key, folder in folders.items() if folder} == {"lang-c": "/built", "ascii": "/built"}
+    monkeypatch.delenv(name)
+    assert not [key for key, row in rows().items() if name in environment_of(row, tmp_path)]
+
+
 @pytest.mark.parametrize(
     ("changes", "names"),
     [

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import refuses
+from pipeline import shaped
 from quick import quick
 from same_bytes import PLAIN, SETTINGS, Stepped, assert_alike, scene_for, stepped, write_known_scene
 
@@ -52,7 +53,7 @@ def test_every_setting_has_its_bytes(
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", ["plain", "contributions", "late", "all"])
 def test_in_groups_too(default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
-    check_uses(default_device.with_shape(lanes=1, items=64), ("1",), folder, monkeypatch, setting)
+    check_uses(shaped(default_device, 1, 64), ("1",), folder, monkeypatch, setting)
 
 
 def check_uses(

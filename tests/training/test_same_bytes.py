@@ -216,7 +216,7 @@ def test_every_driver_trains_alike(
     config = SETTINGS[name]
 
     def trained(on: Device) -> State:
-        trainer = Trainer(scene_for(folder, config), config, on.with_shape(lanes=1, items=1))
+        trainer = Trainer(scene_for(folder, config), config, shaped(on, 1, 1))
         run_steps(24, trainer)
         return trainer.checkpoint()[0]
 

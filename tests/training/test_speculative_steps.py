@@ -7,6 +7,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from calls import noted, refuses
+from pipeline import shaped
 from quick import quick
 from same_bytes import assert_alike, stepped
 from tiny import run_steps, short, trained_to
@@ -46,7 +47,7 @@ TOO_SMALL = {
 def test_trained_by_capacity_is_trained_with_exact_counts(
     device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, steps: str
 ) -> None:
-    device = device.with_shape(lanes=1, items=64) if steps == "in groups" else device
+    device = shaped(device, 1, 64) if steps == "in groups" else device
     exact = stepped(scene, CONFIG, device, monkeypatch, capacity=False)
     other = stepped(scene, CONFIG, device, monkeypatch, capacity=True, too_small=TOO_SMALL[steps])
     assert exact[2].pending.redone == 0
@@ -87,13 +88,14 @@ def test_a_step_by_capacity_waits_for_no_number(
     assert len(device.under_way) < 10, "what the device has read is let go of"
 
 
-@pytest.mark.parametrize("items", quick((1, 64), 64))
+@pytest.mark.slow
+@pytest.mark.parametrize("items", [1, 64])
 def test_a_step_in_groups_is_all_from_command_buffers(
     default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, items: int
 ) -> None:
     """Whichever photograph it has."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
-    device = default_device.with_shape(lanes=1, items=items)
+    device = shaped(default_device, 1, items)
     trainer = Trainer(scene, short(iterations=200, sh_degree=0, density={"every": 0, "stop": 200}), device)
     run_steps(1 + MAX_COUNTED_PASSES * len(trainer.views), trainer)  # then the most pairs of a view are known
     launched: list[str] = []
@@ -106,10 +108,11 @@ def test_a_step_in_groups_is_all_from_command_buffers(
         assert not launched
 
 
+@pytest.mark.slow
 def test_long_lists_are_sorted_by_radix(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the step after the one that found a list too long, until the model grows; at once where the mean is."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
-    device = default_device.with_shape(lanes=1, items=64)
+    device = shaped(default_device, 1, 64)
     trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), device, RasterizerConfig())
     frames: list[ForwardPass] = []
     noted(monkeypatch, SpeculativeSteps, "seen", lambda _, frame: frames.append(frame))

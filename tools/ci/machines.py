@@ -56,6 +56,10 @@ IN_ALL = ("pypi-pocl", "debian-pocl", "intel", "intel-skx")
 """Machines that a short table leaves out: `all` tests their drivers in a new home too, and other machines have each of
 these drivers alone. Intel's runtime builds for AVX-512 in `all` too where the processor has it."""
 
+BUILT_KERNELS = "POCL_CACHE_DIR"
+"""Environment variable with the caller's folder of kernels that PoCL has built. `lang-c` and `ascii` load kernels from
+this folder. Only the encoding of text differs on these two machines, and builds do not depend on the encoding."""
+
 SHORT = """
 import sys
 from clsplat.cli.main import main
@@ -185,6 +189,7 @@ def machines(found: Found) -> list[Machine]:
         return Machine(name, purpose, tests, pypi=True, **{"missing": no_pypi, **changes})
 
     made = ten_steps("{folder}/made")
+    built = ((BUILT_KERNELS, os.environ[BUILT_KERNELS]),) if BUILT_KERNELS in os.environ else ()
     every = tuple(
         (name, path) for name, path in (*debian, *intel, *rusticl) if path
     )  # other rows report what is missing here
@@ -232,13 +237,13 @@ def machines(found: Found) -> list[Machine]:
             "lang-c",
             "LANG=C, and a scene with letters beyond ASCII in its path",
             *ten_steps("{folder}/made/é"),
-            variables=(("LANG", "C"),),
+            variables=(("LANG", "C"), *built),
         ),
         at_home(
             "ascii",
             "LC_ALL=C with Python kept from making UTF-8 of it",
             *made,
-            variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
+            variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0"), *built),
         ),
     ]
 
