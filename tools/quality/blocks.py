@@ -357,6 +357,7 @@ def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str)
             across, along = (colour_steps(images, judge, ground, lines) for lines in (borders, beside))
             cells += [f"{value:.2f}" for value in (np.mean(across), max(across), np.mean(along))]
         yield kind, name, *(cells[:3] if images is of_whole else cells)
-        file = f"{scene.views[place].name.replace('/', '-')}-{kind.translate(str.maketrans(' ', '-', ",'"))}-{name}.png"
+        label = kind.replace(",", "").replace("'", "").replace(" ", "-")
+        file = f"{scene.views[place].name.replace('/', '-')}-{label}-{name}.png"
         write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
     return 0
