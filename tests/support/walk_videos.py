@@ -120,16 +120,25 @@ def _camera(width: int, height: int, angle: float, yaw: float, hand: NDArray[np.
     return Camera(width, height, focal, focal, width / 2, height / 2, rotation, translation)
 
 
-def write_walk(path: Path, frames: Sequence[NDArray[Any]], fps: int = 10, *, hlg: bool = False, turns: int = 0) -> Path:
+def write_walk(
+    path: Path,
+    frames: Sequence[NDArray[Any]],
+    fps: int = 10,
+    *,
+    hlg: bool = False,
+    turns: int = 0,
+    bits_per_pixel: float | None = None,
+) -> Path:
     """Write a video of frames (H, W, 3) in [0, 1]: H.264 of 8 bits, or HEVC of 10 bits and HLG.
 
     turns: counter-clockwise quarter turns of the stored pixels, which the file's display matrix undoes.
+    bits_per_pixel: mean number of bits for a pixel of a frame; None for the encoder's constant quality 12.
     Returns the path.
     """
     import av
 
     with av.open(str(path), "w") as container:
-        options = {"crf": "12", "preset": "veryfast"}
+        options = {"preset": "veryfast"} | ({"crf": "12"} if bits_per_pixel is None else {})
         stream = container.add_stream("libx265" if hlg else "libx264", rate=fps, options=options)
         if hlg:
             stream.codec_context.options = {**options, "x265-params": "log-level=none:pools=1:frame-threads=1"}
@@ -137,6 +146,8 @@ def write_walk(path: Path, frames: Sequence[NDArray[Any]], fps: int = 10, *, hlg
         stream.height, stream.width = (side + side % 2 for side in first.shape[:2])
         stream.pix_fmt = "yuv420p10le" if hlg else "yuv420p"
         context = stream.codec_context
+        if bits_per_pixel is not None:
+            context.bit_rate = round(bits_per_pixel * stream.height * stream.width * fps)
         context.color_range = 1
         context.colorspace, context.color_primaries, context.color_trc = (9, 9, 18) if hlg else (1, 1, 1)
         for index, image in enumerate(frames):

@@ -35,7 +35,13 @@ MAX_LOSS_DB = 1.0
 SUB_FRAMES_PER_EXPOSURE_SECOND = 140
 """Pictures that are averaged for a frame of a moving camera, for each second that the shutter is open: 7 at 10 frames a
 second, 3 at 30. The largest shake then moves the picture by about a pixel from one to the next at the default size."""
-KINDS: dict[str, dict[str, Any]] = {"plain": {}, "hlg": {"hlg": True}, "turned": {"turns": 1}}
+PHONE_BITS_PER_PIXEL = 0.27
+"""Bits for a pixel of H.264 as phones record it: 17 Mbit/s for 1920x1080 at 30 frames a second."""
+KINDS: dict[str, dict[str, Any]] = {
+    "plain": {"bits_per_pixel": PHONE_BITS_PER_PIXEL},
+    "hlg": {"hlg": True},
+    "turned": {"turns": 1, "bits_per_pixel": PHONE_BITS_PER_PIXEL},
+}
 """Arguments of `write_walk` by the kind of video."""
 
 
