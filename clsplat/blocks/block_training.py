@@ -70,7 +70,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)
         run = Run.create(folder, config, scene=plan.scene, resume=is_run(folder), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "train", str(city), "--block", name])
-        train(part, run, Start(model, region, _with_appearance(coarse), trains_appearance=True))
+        train(part, run, Start(model, region, _with_appearance(coarse)))
         keep_done(folder, plan.digest, plan.coarse)
     return True
 
@@ -98,9 +98,7 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
         remove(city / DONE_FILE)  # of fewer steps: if it stayed, an interrupted training would count as finished
         run = Run.create(city, config, scene=plan.scene, resume=is_run(city), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "finish", str(city)])
-        learnt = _with_appearance(coarse)
-        parts = tuple(city / BLOCKS_FOLDER / block.name for block in plan.cells) if learnt is not None else ()
-        start = Start(Gaussians.load(city / MERGED_FILE), None, learnt, parts, trains_appearance=True)
+        start = Start(Gaussians.load(city / MERGED_FILE), None, _with_appearance(coarse), trains_appearance=True)
         train(scene_of_finish(scene, plan, coarse), run, start)
         _copy_refined(coarse, run)
         keep_done(city, plan.digest, merged)

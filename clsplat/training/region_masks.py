@@ -48,7 +48,7 @@ def with_region_masks(scene: Scene, start: Start, device: Device, config: Raster
             camera = camera.resized(*size)
         shares = renderer.render_shares(model, camera.before(scene.near), owners, 2)
         pixels = shows_region(shares, unbounded=unbounded)
-        if (pixels & ((shares > 0).any(axis=2) | unbounded)).mean() < MIN_USED_PIXELS:
+        if (pixels & (shares[:, :, 0] > 0)).mean() < MIN_USED_PIXELS:
             return None
         return view if pixels.all() else replace(view, region_mask=RegionMask.of(pixels))
 
@@ -59,7 +59,7 @@ def with_region_masks(scene: Scene, start: Start, device: Device, config: Raster
             f"start: none of the {len(scene.train_views):,} training photographs shows the region in at least "
             f"{100 * MIN_USED_PIXELS:g} % of its pixels, expected photographs of its Gaussians"
         )
-    return replace(scene, views=views)
+    return replace(scene, views=views, whole_extent=scene.extent)
 
 
 def shows_region(shares: Float32, *, unbounded: bool) -> Bool:

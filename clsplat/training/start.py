@@ -27,15 +27,12 @@ class Start:
         pixels that show what is outside out of the loss (`training.region_masks`).
     appearance_of: folder of a run whose appearance is used for photographs of the same name, and is not trained. None
         means that the training has an appearance of its own.
-    appearance_parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of
-        their appearances, in place of that of `appearance_of`.
     trains_appearance: True to train the appearance from where `appearance_of` has it.
     """
 
     model: Gaussians | None = None
     region: TrainedRegion | None = None
     appearance_of: Path | None = None
-    appearance_parts: tuple[Path, ...] = ()
     trains_appearance: bool = False
 
 

@@ -186,6 +186,29 @@ def test_frames_with_few_neighbours_are_not_shaken() -> None:
     damaged.sharpness[20:40:2] = 0.9
     damaged.whole[20:40:2] = False
     assert not shaken_frames(damaged)[damaged.whole].any()
+    assert not blurred_frames(damaged)[damaged.whole].any()
+    assert len(choose(damaged, 60).frames) == 50
+
+
+def test_a_video_out_of_focus_has_frames() -> None:
+    """Its sharpness is below that of a smooth picture."""
+    assert len(choose(made([0.02] * 60, [SMOOTH_SHARPNESS - 0.001] * 60), 30).frames) == 30
+
+
+def test_a_gap_of_blurred_frames_gets_a_shaken_frame_before_them() -> None:
+    sharpness = np.full(240, 0.35)
+    sharpness[90:96], sharpness[96:104] = 0.335, 0.30
+    measured = made([0.02] * 240, sharpness.tolist(), fps=30.0)
+    assert {*range(90, 96)} & set(choose(measured, 80).frames)
+
+
+def test_more_frames_than_are_sharp() -> None:
+    """A walk, a rest and a walk, with every third frame shaken: all sharp frames, as for a smaller number."""
+    sharpness = np.where(np.arange(180) % 3 == 2, 0.335, 0.35)
+    measured = made([0.02] * 60 + [0.0] * 60 + [0.02] * 60, sharpness.tolist())
+    counts = [len(choose(measured, count).frames) for count in (100, 125, 150, 180)]
+    assert counts == sorted(counts)
+    assert counts[1] >= 120
 
 
 def test_sharp_frames_beside_a_shaken_part_take_its_place() -> None:

@@ -61,14 +61,9 @@ def values(trainer: Trainer) -> dict[str, np.ndarray]:
 def of_run(run: Run) -> dict[str, np.ndarray]:
     record = photographs(json.loads(run.appearance_path.read_text()))
     if run.config.appearance == "grid":
-        grids = grids_of_run(run)
+        grids = np.load(run.appearance_path.with_suffix(".npz"))["grids"]
         return {name: grids[row["grid"]] for name, row in record.items()}
     return {name: np.concatenate([row[part] for part in sorted(row)]) for name, row in record.items()}
-
-
-def grids_of_run(run: Run) -> np.ndarray:
-    with np.load(run.appearance_path.with_suffix(".npz")) as file:
-        return file["grids"]
 
 
 def test_a_fixed_appearance_stays_and_the_model_learns(earlier: Run, scene: Scene, default_device: Device) -> None:
@@ -82,35 +77,6 @@ def test_a_fixed_appearance_stays_and_the_model_learns(earlier: Run, scene: Scen
     for name, value in now.items():
         assert_same_bits(value, known[name], name)
     assert (before.means != trainer.gaussians().means).any()
-
-
-def test_photographs_of_parts_begin_with_the_mean_of_theirs(
-    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path
-) -> None:
-    """The first part has learnt three photographs, and the second two of them otherwise; the others are the whole's."""
-    names, record = [view.name for view in scene.train_views], json.loads(earlier.appearance_path.read_text())
-    is_grid = earlier.config.appearance == "grid"
-    parts = [tmp_path / "a", tmp_path / "b"]
-    for part, known, factor in zip(parts, (names[:3], names[1:3]), (1.5, 2.5), strict=True):
-        part.mkdir()
-        rows = {name: dict(record["photographs"][name]) for name in known}
-        if is_grid:
-            np.savez(part / "appearance.npz", grids=np.float32(factor) * grids_of_run(earlier))
-        else:
-            for row in rows.values():
-                row["log2_gains"] = [factor * gain for gain in row["log2_gains"]]
-        (part / "appearance.json").write_text(json.dumps({**record, "photographs": rows}))
-    start = Start(earlier.model, appearance_of=earlier.path, appearance_parts=tuple(parts))
-    trainer = Trainer(scene, earlier.config, default_device, start)
-    now, known = photographs(trainer.appearance.record() or {}), record["photographs"]
-    for name, factor in zip(names, (1.5, 2.0, 2.0, *[1.0] * (len(names) - 3)), strict=True):
-        if is_grid:
-            found, wanted = values(trainer)[name], grids_of_run(earlier)[known[name]["grid"]]
-        else:
-            found, wanted = now[name]["log2_gains"], known[name]["log2_gains"]  # type: ignore[index]
-            assert {**now[name], "log2_gains": 0} == {**known[name], "log2_gains": 0}  # type: ignore[dict-item]
-        # the mean is one of float64, and rounded once
-        np.testing.assert_allclose(found, factor * np.asarray(wanted), rtol=1e-6, atol=1e-7)
 
 
 def test_the_loss_is_that_of_the_earlier_appearance(earlier: Run, scene: Scene, default_device: Device) -> None:

@@ -436,7 +436,10 @@ def test_nothing_left_in_the_region(scene: Scene, default_device: Device) -> Non
     model = start_model()
     model.opacity_logits[REGION.contains(model.means)] = -9  # below --density.min-opacity
     config = short(iterations=16, density={"opacity_reset_every": 0})
+    trainer = to_end(scene, config, default_device, Start(model, REGION))
     with pytest.raises(ClsplatError, match=r"no Gaussian is left in the region.*--density.min-opacity"):
+        trainer.finish()
+    with pytest.raises(InputError, match="none of the 8 training photographs shows the region"):
         train(scene, config, device=default_device, start=Start(model, REGION))
 
 

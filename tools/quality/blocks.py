@@ -145,17 +145,6 @@ def own_appearance() -> Iterator[None]:
 
 
 @contextmanager
-def frozen_appearance() -> Iterator[None]:
-    """Context in which blocks keep the coarse model's appearance, and the finish begins with it."""
-
-    def start(model: Gaussians, region: TrainedRegion | None, learnt: Path | None, *_: object, **__: object) -> Start:
-        return Start(model, region, learnt, trains_appearance=region is None)
-
-    with patch.object(block_training, "Start", start):
-        yield
-
-
-@contextmanager
 def no_surroundings() -> Iterator[None]:
     """Context in which blocks begin with the Gaussians of their widened cell alone, and train them everywhere."""
 
@@ -323,8 +312,6 @@ def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str)
     city = city_of(given, town, "exposure", settings)
     with own_appearance():
         other = city_of(given, town, "exposure own", settings, planned=city)
-    with frozen_appearance():
-        frozen = city_of(given, town, "exposure frozen", settings, planned=city)
     whole = trained(given, "whole exposure", town, settings=settings, iterations=round(EXTRA_STEPS * given.iterations))
     borders = borders_of(read_plan(city))
     beside = [replace(border, at=border.at + side * BESIDE_METRES) for border in borders for side in (-1, 1)]
@@ -346,7 +333,7 @@ def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str)
     ground = ground_of(renderer, whole.model, scene.views, read_plan(city))
     shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
     place = int(np.argmax(shares))
-    kinds = {"begun from the coarse model's": city, "the coarse model's, frozen": frozen, "their own": other}
+    kinds = {"of the coarse model": city, "their own": other}
     models = {(kind, name): model for kind, folder in kinds.items() for name, model in models_of(folder).items()}
     for (kind, name), images in {
         ("-", "whole"): of_whole,
@@ -357,7 +344,6 @@ def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str)
             across, along = (colour_steps(images, judge, ground, lines) for lines in (borders, beside))
             cells += [f"{value:.2f}" for value in (np.mean(across), max(across), np.mean(along))]
         yield kind, name, *(cells[:3] if images is of_whole else cells)
-        label = kind.replace(",", "").replace("'", "").replace(" ", "-")
-        file = f"{scene.views[place].name.replace('/', '-')}-{label}-{name}.png"
+        file = f"{scene.views[place].name.replace('/', '-')}-{kind.replace(' ', '-')}-{name}.png"
         write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
     return 0

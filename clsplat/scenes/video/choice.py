@@ -38,7 +38,7 @@ before it and of those after it."""
 MIN_NEIGHBOURS = 4
 """Least number of neighbours before a frame, and after it, with which it is compared for shake."""
 MAX_GAP_STRETCHES = 3.0
-"""Longest part of the camera's path without a chosen frame, in stretches, for which there are shaken frames."""
+"""A part of the camera's path that is longer than this many stretches gets a shaken frame if it has no other."""
 NEIGHBOUR_SECONDS = 1.0
 """A frame's neighbours are the frames up to this many seconds before and after it."""
 MAX_ALIKE_RMS_LEVELS, MAX_ALIKE_RMS_PER_GRADIENT = 1.0, 0.2
@@ -72,12 +72,11 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
     """Choose frames of a video. count: number of frames; None for a number by length and motion.
 
     The camera's path is divided into `count` stretches of equal motion, so that a camera that stands still gives one
-    frame. If there are hardly more frames than that, each is a stretch. The sharpest frame of each stretch is chosen,
-    or the sharpest in the stretch's middle half if it is sharper than the stretch's median. Fast, blurred, shaken and
-    damaged frames are not usable, but a shaken frame is chosen rather than none on a part of the path as long as
-    MAX_GAP_STRETCHES. If stretches have no usable frame, the path is divided into more, up to MAX_STRETCHES_PER_FRAME
-    times as many, so that the number of frames comes near to `count`. Of two alike frames in a row, the less sharp one
-    is left out.
+    frame. If no more frames than that are usable, each is a stretch. The sharpest frame of each stretch is chosen, or
+    the sharpest in its middle half if it is sharper than the stretch's median. Fast, blurred, shaken and damaged frames
+    are not usable, but a part of the path that is longer than MAX_GAP_STRETCHES gets a shaken frame if it has no other.
+    If stretches have no usable frame, the path is divided into more, up to MAX_STRETCHES_PER_FRAME times as many, so
+    that the number of frames comes near to `count`. Of two alike frames in a row, the less sharp one is left out.
     """
     fast, blurred = fast_frames(measured), blurred_frames(measured)
     path = travelled(measured, fast)
@@ -86,9 +85,9 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
     able = measured.whole & ~fast & ~blurred
     usable = able & ~shaken_frames(measured)
 
-    def divided(number: int) -> Choice:
-        """The choice of a frame of each of `number` stretches, or of each frame as a stretch if there are few."""
-        if wanted >= able.sum():
+    def divided(number: int | None) -> Choice:
+        """The choice of a frame of each of `number` stretches. None: each frame is a stretch."""
+        if number is None:
             stretches = np.arange(len(measured))
         else:
             stretches = np.minimum((path / max(total, 1e-9) * number).astype(np.int64), number - 1)
@@ -97,15 +96,18 @@ def choose(measured: Measurements, count: int | None = None) -> Choice:
         for inside in _parts(stretches):
             best = _sharpest(measured.sharpness, path, inside, usable)
             if best is None and (path[inside[-1]] - last) * wanted > MAX_GAP_STRETCHES * total:
-                best = _sharpest(measured.sharpness, path, inside, able)
+                since = np.arange(chosen[-1] + 1 if chosen else 0, inside[-1] + 1)
+                best = _sharpest(measured.sharpness, path, since, able)
             if best is not None:
                 chosen.append(best)
                 last = float(path[best])
         return Choice(np.array(unlike(chosen, measured), np.int64), stretches, fast, blurred, total, wanted)
 
+    if usable.sum() <= wanted and len((choice := divided(None)).frames) <= wanted:
+        return choice
     fewest, most = wanted, MAX_STRETCHES_PER_FRAME * wanted + 1
     choice = divided(fewest)
-    while most - fewest > 1 and len(choice.frames) < wanted < able.sum():
+    while most - fewest > 1 and len(choice.frames) < wanted:
         middle = (fewest + most) // 2
         tried = divided(middle)
         if len(tried.frames) <= wanted:
@@ -148,8 +150,9 @@ def fast_frames(measured: Measurements) -> NDArray[np.bool_]:
 def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
     """Return a mask (F,) of the frames that are much less sharp than their neighbours."""
     detail, first, last = _neighbourhoods(measured)
-    around = np.array([np.quantile(detail[low:high], 0.75) for low, high in zip(first, last, strict=True)])
-    return np.asarray(detail < BLURRED_RATIO * around)
+    parts = (detail[low:high][measured.whole[low:high]] for low, high in zip(first, last, strict=True))
+    around = np.array([np.quantile(part, 0.75) if len(part) else 0.0 for part in parts])
+    return np.asarray(detail < around - (1 - BLURRED_RATIO) * np.abs(around))
 
 
 def shaken_frames(measured: Measurements) -> NDArray[np.bool_]:
@@ -167,7 +170,7 @@ def shaken_frames(measured: Measurements) -> NDArray[np.bool_]:
 
     sides = enumerate(zip(first, last, strict=True))
     both = np.array([min(usual(low, index), usual(index + 1, high)) for index, (low, high) in sides])
-    return np.asarray(detail < SHAKEN_RATIO * both)
+    return np.asarray(detail < both - (1 - SHAKEN_RATIO) * np.abs(both))
 
 
 def _neighbourhoods(measured: Measurements) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64]]:

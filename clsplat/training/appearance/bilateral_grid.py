@@ -115,15 +115,14 @@ class GridsOfAll(Appearance):
         self._grids = Grids.on(device, np.ascontiguousarray(start))
         self._fixed = False
 
-    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
+    def begin_from(self, folder: Path, *, fixed: bool) -> None:
         """Begin with the grids that the run in `folder` has learnt, by the names of the photographs.
 
-        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs.
         fixed: True if the grids stay as they are.
         Raises InputError if the run has no grids of this size for all training photographs.
         """
         names = [view.name for view in self._scene.train_views]
-        self._grids, self._fixed = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE, parts)), fixed
+        self._grids, self._fixed = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE)), fixed
 
     @property
     def pixel_bytes(self) -> int:

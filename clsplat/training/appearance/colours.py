@@ -209,23 +209,19 @@ class ColoursOfAll(Appearance):
         self._earlier: NDArray[np.float32] | None = None
         self._fixed = False
 
-    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
+    def begin_from(self, folder: Path, *, fixed: bool) -> None:
         """Begin with the entries that the run in `folder` has learnt, by the names of the photographs.
 
-        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs,
-            and a lens with the mean of its photographs.
         fixed: True if the entries stay as they are.
         Raises InputError if the run has not learnt this colour model of all training photographs.
         """
         views, model = self._scene.train_views, self._model
-        own, of_lenses = entries_of(folder, [view.name for view in views], model, parts)
+        own, of_lenses = entries_of(folder, [view.name for view in views], model)
         self._earlier, self._fixed = own.astype(np.float32), fixed
         if self._lenses is not None:
-            lenses = np.array([taken.lens for taken in self._taken])
-            values = np.zeros((len(self._lens_rows), model.lens_entries))
-            np.add.at(values, lenses, of_lenses)
-            values /= np.maximum(np.bincount(lenses, minlength=len(values)), 1)[:, None]
-            self._lenses = Gains.on(self._device, values.astype(np.float32))
+            values = np.zeros((len(self._lens_rows), model.lens_entries), np.float32)
+            values[[taken.lens for taken in self._taken]] = of_lenses
+            self._lenses = Gains.on(self._device, values)
 
     @cached_property
     def _gains(self) -> Gains:
