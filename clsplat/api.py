@@ -82,8 +82,8 @@ def train(
         Continue from the run's latest checkpoint. If False, a run that has checkpoints or metrics is refused.
     start : Start
         What to begin with in place of Gaussians from the scene's points: a model, the region in which it is trained,
-        and another run's appearance. With a region, the loss leaves out the pixels that show what is outside, by the
-        model. To resume, give the same start again.
+        and another run's appearance. With a region, the loss leaves out pixels in which the model shows Gaussians from
+        outside. To resume, give the same start again.
     on_step : callable, optional
         Called with a report every 10 steps (`REPORT_EVERY` in `clsplat/training/loop.py`).
     on_plan : callable, optional

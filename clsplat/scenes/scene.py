@@ -93,6 +93,11 @@ class View:
         """Files that the pixels come from: the photograph, and its mask if it has one."""
         return (self.path,) if self.mask is None or self.mask.path is None else (self.path, self.mask.path)
 
+    @property
+    def ignores(self) -> bool:
+        """True if training may ignore pixels of the photograph."""
+        return self.region_mask is not None or (self.mask is not None and self.mask.ignores)
+
     def stamped(self) -> View:
         """Return the view with its files' current sizes and modification times. Raises OSError for a missing file."""
         return replace(self, stamps=tuple(_stamp(path) for path in self.files))
@@ -118,11 +123,6 @@ class View:
         """
         image = self.load_masked(width, height)
         return image if image.shape[2] < 5 else np.ascontiguousarray(image[:, :, : 3 + _has_alpha(image)])
-
-    @property
-    def ignores(self) -> bool:
-        """True if training may ignore pixels of the photograph."""
-        return self.region_mask is not None or (self.mask is not None and self.mask.ignores)
 
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read like `load`. If a mask leaves pixels out, there is a fifth channel: 1 for kept pixels, else 0.

@@ -18,7 +18,7 @@ from clsplat.scenes.supervision.region_mask import RegionMask
 from clsplat.training.start import Start
 
 MIN_REGION_SHARE = 0.25
-"""A pixel is used if at least this share of what Gaussians cover in it is covered from inside the region."""
+"""A pixel is used if Gaussians inside the region make up at least this share of its coverage."""
 MIN_USED_PIXELS = 0.01
 """A photograph is used if at least this fraction of its pixels shows the region. The loss is a mean over these
 pixels, so that few of them would count as much as a whole photograph."""
@@ -66,7 +66,7 @@ def shows_region(shares: Float32, *, unbounded: bool) -> Bool:
     """Mask (H, W) of the pixels that show a region, or nothing.
 
     shares: (H, W, 2), coverage of each pixel by the Gaussians inside and outside the region.
-    unbounded: True if what no Gaussian covers belongs to the region too, as the sky.
+    unbounded: True if the uncovered part of a pixel belongs to the region too, as the sky.
     """
     inside, outside = shares[:, :, 0], shares[:, :, 1]
     if unbounded:

@@ -23,8 +23,8 @@ class Start:
     """Start of a training from a model, in place of Gaussians from the scene's points.
 
     model: the initial Gaussians. None makes them from the scene's points.
-    region: the region in which the training changes Gaussians. None means everywhere. `train` leaves the
-        pixels that show what is outside out of the loss (`training.region_masks`).
+    region: the region in which the training changes Gaussians. None means everywhere. `train` leaves
+        pixels that show frozen Gaussians out of the loss (`training.region_masks`).
     appearance_of: folder of a run whose appearance is used for photographs of the same name, and is not trained. None
         means that the training has an appearance of its own.
     trains_appearance: True to train the appearance from where `appearance_of` has it.

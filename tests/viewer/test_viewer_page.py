@@ -145,7 +145,9 @@ def test_a_phone_held_upright_shows_the_first_photograph_from_side_to_side(
         for step in range(10):
             page.mouse.move(200 + 8 * step, 400)
             page.wait_for_timeout(30)
-        page.get_by_text("coarse").wait_for()  # the same label says "exact" later, on a busy machine at once
+        page.wait_for_function(  # both at one moment: on a busy machine "coarse" soon becomes "exact" again
+            "() => document.body.innerText.includes('coarse') && !/exact/i.test(document.body.innerText)"
+        )
         page.mouse.up()
         page.get_by_text(EXACT).wait_for()
     finally:

@@ -33,8 +33,8 @@ BLURRED_RATIO = 0.6
 """A frame is blurred if its detail (sharpness minus SMOOTH_SHARPNESS) is below this fraction of the upper quartile of
 its neighbours' detail."""
 SHAKEN_RATIO = 0.9
-"""A frame is shaken if its detail is below this fraction of the upper quartile of its neighbours' detail, both of those
-before it and of those after it."""
+"""A frame is shaken if its detail is below this fraction of the upper quartile of its earlier neighbours' detail, and
+of its later neighbours'."""
 MIN_NEIGHBOURS = 4
 """Least number of neighbours before a frame, and after it, with which it is compared for shake."""
 MAX_GAP_STRETCHES = 3.0
@@ -158,7 +158,7 @@ def blurred_frames(measured: Measurements) -> NDArray[np.bool_]:
 def shaken_frames(measured: Measurements) -> NDArray[np.bool_]:
     """Return a mask (F,) of the frames that are less sharp than their neighbours before and after them.
 
-    Where detail rises or falls with what the camera sees, the neighbours on one side have no more than the frame.
+    Where detail rises or falls because the view changes, the neighbours on one side have no more than the frame.
     Damaged frames are no neighbours. Frames with fewer than MIN_NEIGHBOURS on a side are not in the mask.
     """
     detail, first, last = _neighbourhoods(measured)
