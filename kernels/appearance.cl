@@ -62,14 +62,15 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   moved[i] = logs[i] - (c < 3 ? rate : slow * rate) * m / fma1(sqrt(v), root, epsilon);
 }
 
-// Subtracts each entry's mean over the photographs, if `centred`, and then limits the entries: moved -> logs; gains:
-// 2^logs.
+// Shifts each entry so that its mean over the photographs is the mean of `start`, if `centred`, and then limits the
+// entries: moved, start -> logs; gains: 2^logs.
 __kernel void centre_gains(const int count, const int entries, const int centred, __global const uint *readback,
-                           __global const float *moved, __global float *logs, __global float *gains) {
+                           __global const float *start, __global const float *moved, __global float *logs,
+                           __global float *gains) {
   const int i = get_global_id(0), c = i % entries;
   if (i >= count || readback[READBACK_STOPPED]) return;
   float sum = 0.0f;
-  for (int k = c; centred && k < count; k += entries) sum += moved[k];
+  for (int k = c; centred && k < count; k += entries) sum += moved[k] - start[k];
   const float most = c < 3 ? MOST_LOG : MOST_MIX;
   const float x = clamp(moved[i] - (float)entries * sum / (float)count, -most, most);
   logs[i] = x;

@@ -167,13 +167,13 @@ __kernel void move_grid(const int photograph, const float rate, const float root
   grids[at] -= rate * m / fma1(sqrt(v), root, epsilon);
 }
 
-// Shifts the grids of all photographs in place, so that their mean over the photographs is the identity.
-__kernel void centre_grids(const int photographs, __global const uint *readback, __global float *grids) {
+// Shifts the grids of all photographs in place, so that their mean over the photographs is the grid `mean`.
+__kernel void centre_grids(const int photographs, __global const uint *readback, __global const float *mean,
+                           __global float *grids) {
   const int item = get_global_id(0);
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;
-  const float own = item % MAP % 5 == 0 ? 1.0f : 0.0f;
   float sum = 0.0f;
-  for (int p = 0; p < photographs; ++p) sum += grids[(size_t)p * GRID_FLOATS + item] - own;
-  const float mean = sum / (float)photographs;
-  for (int p = 0; p < photographs; ++p) grids[(size_t)p * GRID_FLOATS + item] -= mean;
+  for (int p = 0; p < photographs; ++p) sum += grids[(size_t)p * GRID_FLOATS + item] - mean[item];
+  const float shift = sum / (float)photographs;
+  for (int p = 0; p < photographs; ++p) grids[(size_t)p * GRID_FLOATS + item] -= shift;
 }

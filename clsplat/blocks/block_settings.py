@@ -47,6 +47,9 @@ def block_settings(plan: BlockPlan, block: Block, coarse: TrainConfig, surroundi
         iterations=block.iterations,
         eval_at=(),
         report=False,
+        appearance_rate=appearance_rate_of_part(
+            whole.appearance_rate, whole.appearance, whole.iterations, block.iterations
+        ),
         depth_weight=whole.depth_weight * DEPTH_WEIGHT_END_FRACTION ** (passed / whole.iterations),
         optimiser=replace(
             _for_fewer_photographs(optimiser, plan.photographs / len(block.photographs)),

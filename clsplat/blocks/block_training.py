@@ -70,7 +70,7 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)
         run = Run.create(folder, config, scene=plan.scene, resume=is_run(folder), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "train", str(city), "--block", name])
-        train(part, run, Start(model, region, _with_appearance(coarse)))
+        train(part, run, Start(model, region, _with_appearance(coarse), trains_appearance=True))
         keep_done(folder, plan.digest, plan.coarse)
     return True
 
@@ -98,7 +98,10 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
         remove(city / DONE_FILE)  # of fewer steps: if it stayed, an interrupted training would count as finished
         run = Run.create(city, config, scene=plan.scene, resume=is_run(city), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "finish", str(city)])
-        start = Start(Gaussians.load(city / MERGED_FILE), None, _with_appearance(coarse), trains_appearance=True)
+        learnt = _with_appearance(coarse)
+        parts = tuple(city / BLOCKS_FOLDER / block.name for block in plan.cells) if learnt is not None else ()
+        model = Gaussians.load(city / MERGED_FILE)
+        start = Start(model, None, learnt, trains_appearance=True, appearance_parts=parts)
         train(scene_of_finish(scene, plan, coarse), run, start)
         _copy_refined(coarse, run)
         keep_done(city, plan.digest, merged)
@@ -107,7 +110,11 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
 
 def is_trained(city: Path, plan: BlockPlan, block: Block) -> bool:
     """True if the training of a block has finished. Raises InputError for a damaged record of it."""
-    return is_done(city / BLOCKS_FOLDER / block.name, plan.digest)
+    folder = city / BLOCKS_FOLDER / block.name
+    if not is_done(folder, plan.digest):
+        return False
+    # the finish needs the appearance too, which may not have been copied with the model
+    return plan.settings.appearance == "none" or (folder / "appearance.json").exists()
 
 
 def is_finished(city: Path, plan: BlockPlan, steps: int | None) -> bool:

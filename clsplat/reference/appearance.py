@@ -41,16 +41,16 @@ def step(
     number: int,
     rate: float | Float64,
     *,
-    centred: bool = True,
+    mean: Float64 | None = None,
 ) -> tuple[Float64, Float64, Float64]:
     """Return entries and both moments (photographs, entries) after step `number` of Adam with the gradient `by_logs`.
 
     logs: the entries before the step; the first three of a photograph are log2 gains.
     number: counts from 1.
     rate: learning rate of all entries, or of each entry.
-    centred: True subtracts each entry's mean over the photographs after the step.
+    mean: (entries,), the mean over the photographs to which each entry is shifted after the step. None shifts nothing.
     """
     first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2
     change = rate * (first / (1 - 0.9**number)) / (np.sqrt(second / (1 - 0.999**number)) + 1e-15)
     moved = logs - change
-    return moved - moved.mean(axis=0) if centred else moved, first, second
+    return moved if mean is None else moved - moved.mean(axis=0) + mean, first, second

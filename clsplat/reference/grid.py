@@ -91,9 +91,9 @@ def variation_gradient(grid: Float64) -> Float64:
     return total
 
 
-def centre(grids: Float64) -> Float64:
-    """Shift the grids (photographs, levels, rows, columns, 3, 4) so that their mean is the identity."""
-    centred: Float64 = grids - grids.mean(axis=0) + np.eye(3, 4)
+def centre(grids: Float64, mean: Float64) -> Float64:
+    """Shift the grids (photographs, levels, rows, columns, 3, 4) so that their mean is `mean`."""
+    centred: Float64 = grids - grids.mean(axis=0) + mean
     return centred
 
 

@@ -7,10 +7,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.config.colour_models import ColourModel
@@ -33,6 +34,7 @@ EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
 MAX_CENTRE_PICTURE_SIZES = 100.0
 """Limit of the magnitude of a vignette centre's coordinates, in picture widths and heights."""
 
+AnyFloats = TypeVar("AnyFloats", Float32, Float64)
 Row = Mapping[str, Any]
 """Entry of one photograph in appearance.json, parsed by `_row`."""
 Look = Callable[[str, Image], Image]
@@ -96,12 +98,25 @@ def held_out_looks(record: Mapping[str, Any] | None) -> Look:
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 
 
-def entries_of(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Float64, Float64]:
+def entries_of(
+    folder: Path, names: Sequence[str], model: ColourModel, parts: Sequence[Path] = ()
+) -> tuple[Float64, Float64]:
     """Return the appearance that the run in `folder` has learnt: the entries of photographs and of lenses.
 
     names: the photographs' names.
+    parts: folders of runs of parts of the scene. Photographs that they have learnt get the means of their entries.
     Returns arrays (photographs, model.entries) and (photographs, model.lens_entries). Raises InputError.
     """
+    own, of_lenses = _entries(folder, names, model)
+    found = [(rows, _entries(part, some, model)) for part, rows, some in _learnt_by(parts, model.stem, names)]
+    return (
+        _means(own, [(rows, tables[0]) for rows, tables in found]),
+        _means(of_lenses, [(rows, tables[1]) for rows, tables in found]),
+    )
+
+
+def _entries(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Float64, Float64]:
+    """Return the entries of photographs and of lenses, as `entries_of`, of one run."""
     path, record = _learnt(folder, model.stem, names)
     try:
         rows = [record["photographs"][name] for name in names]
@@ -119,11 +134,41 @@ def entries_of(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[
     return tables[0], tables[1]
 
 
-def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...]) -> Float32:
+def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...], parts: Sequence[Path] = ()) -> Float32:
     """Return the bilateral grids (photographs, *shape) that the run in `folder` has learnt of photographs.
 
-    names: the photographs' names. Raises InputError.
+    names: the photographs' names. parts: as for `entries_of`. Raises InputError.
     """
+    found = [(rows, _grids(part, some, shape)) for part, rows, some in _learnt_by(parts, "grid", names)]
+    return _means(_grids(folder, names, shape), found)
+
+
+def _learnt_by(
+    parts: Sequence[Path], kind: str, names: Sequence[str]
+) -> list[tuple[Path, NDArray[np.int64], list[str]]]:
+    """Return, for each folder, the indices in `names` of the photographs that its run has learnt, and their names."""
+    found = []
+    for part in parts:
+        _, record = _learnt(part, kind, ())
+        rows = np.array([row for row, name in enumerate(names) if name in record["photographs"]], np.int64)
+        if rows.size:
+            found.append((part, rows, [names[row] for row in rows]))
+    return found
+
+
+def _means(whole: AnyFloats, parts: Sequence[tuple[NDArray[np.int64], AnyFloats]]) -> AnyFloats:
+    """Return `whole` (photographs, ...) with the means over parts, each (rows, values), in the rows that parts have."""
+    sums, counts = np.zeros(whole.shape), np.zeros(len(whole))
+    for rows, values in parts:
+        sums[rows] += values
+        counts[rows] += 1
+    result, has = whole.copy(), counts > 0
+    result[has] = sums[has] / counts[has].reshape(-1, *[1] * (whole.ndim - 1))
+    return result
+
+
+def _grids(folder: Path, names: Sequence[str], shape: tuple[int, ...]) -> Float32:
+    """Return the grids, as `grids_of`, of one run."""
     path, record = _learnt(folder, "grid", names)
     arrays = path.with_suffix(".npz")
     try:

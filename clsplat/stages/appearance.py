@@ -52,7 +52,7 @@ class GainEntries:
 
     first_row: row of `entry_gradient`'s result that belongs to the first entry.
     mix_rate: learning rate of colour mixes, divided by the learning rate of gains.
-    centred: True if the mean of each entry over all rows is subtracted after a step.
+    centred: True if the mean of each entry over all rows stays that of the initial values (`Gains.start`).
     """
 
     first_row: int = 0
@@ -62,7 +62,7 @@ class GainEntries:
     @classmethod
     def of_lens(cls, model: ColourModel) -> GainEntries:
         """Settings for the update of a lens's entries. In the result of `entry_gradient`, these entries come after the
-        photograph's entries. Their mean over the lenses is not subtracted."""
+        photograph's entries. Their mean over the lenses may change."""
         return cls(first_row=model.entries, centred=False)
 
 
@@ -206,5 +206,5 @@ def step_gains(
     matrix = (gains.begins, gains.others, gains.weights)
     read = (readback, columns, gains.start, *matrix, gains.logs)
     launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)
-    settled = (gains.moved, gains.logs, gains.gains)
+    settled = (gains.start, gains.moved, gains.logs, gains.gains)
     launch_items(device, kernels.centre_gains, count, count, width, int(entries.centred), readback, *settled)

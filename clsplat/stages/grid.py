@@ -22,17 +22,22 @@ GRID_FLOATS = int(np.prod(GRID_SHAPE))
 
 @dataclass(frozen=True, eq=False)
 class Grids:
-    """Grids of all photographs, (photographs, *GRID_SHAPE) float32, and their Adam moments."""
+    """Grids of all photographs, (photographs, *GRID_SHAPE) float32, and their Adam moments.
+
+    mean: (*GRID_SHAPE,), the mean of the initial grids over the photographs, which `centre_grids` keeps.
+    """
 
     grids: DeviceArray
     first: DeviceArray
     second: DeviceArray
+    mean: DeviceArray
 
     @classmethod
     def on(cls, device: Device, grids: NDArray[np.float32]) -> Grids:
         """Upload these grids, with Adam moments of zero."""
         zeros = np.zeros_like(grids)
-        return cls(upload(device, grids), upload(device, zeros), upload(device, zeros))
+        mean = grids.mean(axis=0, dtype=np.float64).astype(np.float32)
+        return cls(*(upload(device, values) for values in (grids, zeros, zeros, mean)))
 
 
 def _spans(width: int, height: int) -> tuple[float, float]:
@@ -43,11 +48,11 @@ def _spans(width: int, height: int) -> tuple[float, float]:
 def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
     """Bytes per pixel, padding included: the planes of the transformed image, and a share of the other arrays.
 
-    These are the grids and their moments, the gradient with respect to a grid, and the sums of the gradient along each
-    image row, for the largest of the `sizes` (width, height).
+    These are the grids, their moments and their mean, the gradient with respect to a grid, and the sums of the gradient
+    along each image row, for the largest of the `sizes` (width, height).
     """
     lines = max((height for _, height in sizes), default=0) * GRID_SHAPE[2] * 12 * GRID_SHAPE[0]
-    held = 4 * (3 * GRID_FLOATS * photographs + GRID_FLOATS + lines)
+    held = 4 * (3 * GRID_FLOATS * photographs + 2 * GRID_FLOATS + lines)
     return 12 + -(-held // max((width * height for width, height in sizes), default=1))
 
 
@@ -134,7 +139,7 @@ def step_grid(
 
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
-    """Shift all grids so that their mean over the photographs is the identity transform. Nothing changes if the step's
-    pass has stopped."""
+    """Shift all grids so that their mean over the photographs is that of the initial grids. Nothing changes if the
+    step's pass has stopped."""
     kernel = device.kernels("grid", {"LANES": 1}).centre_grids
-    launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)
+    launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.mean, grids.grids)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What blocks and finish take from the coarse model: appearance and refined cameras, and none of them trained."""
+"""What blocks and finish take from the coarse model: appearance, which they train, and refined cameras."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_city import WHOLE, load, trains_on, write_city
+from small_city import FINISH_STEPS, WHOLE, load, trains_on, write_city
 
 from clsplat.blocks.block_training import finish, train_block
 from clsplat.blocks.merging import merge
@@ -21,6 +21,8 @@ from clsplat.runs.scene_record import read
 from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE, Georeference, read_georeference
 from clsplat.scenes.loading import load_scene_of
 from clsplat.scenes.readers.colmap import read_cameras
+from clsplat.scenes.scene import Scene
+from clsplat.training.start import Start
 
 SETTINGS = replace(
     WHOLE,
@@ -50,21 +52,33 @@ def gains(run: Path) -> dict[str, object]:
     return photographs
 
 
-def test_blocks_have_the_coarse_models_appearance(refined: Path) -> None:
-    coarse = gains(refined / "coarse")
+def test_blocks_and_finish_go_on_with_the_appearance(refined: Path, tmp_path: Path) -> None:
+    """Blocks begin with the coarse model's, and the finish with the means of the blocks'. All train it."""
+    city, starts = shutil.copytree(refined, tmp_path / "city"), list[Start]()
+
+    def stop(_scene: Scene, _run: Run, start: Start) -> None:
+        starts.append(start)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        finish(city, FINISH_STEPS + 1, load(), stop)
+    shutil.rmtree(city / "blocks" / "0_0")
+    with pytest.raises(KeyboardInterrupt):
+        train_block(city, "0,0", load(), stop)
+    last, block = starts
+    assert block.appearance_of == last.appearance_of == city / "coarse"
+    assert (block.trains_appearance, last.trains_appearance) == (True, True)
+    assert (block.appearance_parts, last.appearance_parts) == ((), (city / "blocks" / "0_0", city / "blocks" / "1_0"))
+
+
+def test_all_photographs_of_a_block_get_an_appearance(refined: Path) -> None:
+    coarse, last = gains(refined / "coarse"), gains(refined)
     assert any(np.abs(np.array(row["log2_gains"])).max() > 1e-3 for row in coarse.values())  # type: ignore[index]
+    assert coarse.keys() == last.keys()
     for name in ("0_0", "1_0"):
         block = gains(refined / "blocks" / name)
         assert len(block) == 7
-        assert block == {photograph: coarse[photograph] for photograph in block}
-
-
-def test_the_finish_goes_on_with_the_appearance(refined: Path) -> None:
-    coarse, last = gains(refined / "coarse"), gains(refined)
-    assert coarse.keys() == last.keys()
-    assert coarse != last
-    change = [np.subtract(last[name]["log2_gains"], coarse[name]["log2_gains"]) for name in last]  # type: ignore[index]
-    assert np.abs(change).max() < 0.12, "six steps from there, not from the start"
+        assert all(block[each] != coarse[each] for each in block)
 
 
 def test_blocks_and_finish_have_the_refined_cameras(refined: Path, small_scene: Path) -> None:
@@ -102,6 +116,21 @@ def test_a_city_without_the_learnt_appearance_is_refused(refined: Path, tmp_path
     assert (
         "coarse/appearance.json: no such file, expected a finished run of clsplat train --appearance exposure" in said
     )
+
+
+def test_a_block_without_its_appearance_is_trained_again(refined: Path, tmp_path: Path, default_device: Device) -> None:
+    """As when someone has copied the models of blocks alone."""
+    from calls import refusal
+
+    city = shutil.copytree(refined, tmp_path / "city")
+    learnt = city / "blocks" / "0_0" / "appearance.json"
+    content = learnt.read_bytes()
+    assert not train_block(city, "0,0", load(), trains_on(default_device))
+    learnt.unlink()
+    said = refusal(lambda: finish(city, FINISH_STEPS + 1, load(), trains_on(default_device)))
+    assert "0_0/appearance.json: no such file, expected a finished run of clsplat train --appearance exposure" in said
+    assert train_block(city, "0,0", load(), trains_on(default_device))
+    assert learnt.read_bytes() == content
 
 
 def test_the_city_has_the_refined_cameras_and_their_place(refined: Path) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
+from clsplat.training.loop import StepReport
 from clsplat.training.start import Start
 from clsplat.training.trainer import Trainer
 
@@ -61,9 +63,28 @@ def values(trainer: Trainer) -> dict[str, np.ndarray]:
 def of_run(run: Run) -> dict[str, np.ndarray]:
     record = photographs(json.loads(run.appearance_path.read_text()))
     if run.config.appearance == "grid":
-        grids = np.load(run.appearance_path.with_suffix(".npz"))["grids"]
+        grids = grids_of_run(run)
         return {name: grids[row["grid"]] for name, row in record.items()}
     return {name: np.concatenate([row[part] for part in sorted(row)]) for name, row in record.items()}
+
+
+def grids_of_run(run: Run) -> np.ndarray:
+    with np.load(run.appearance_path.with_suffix(".npz")) as file:
+        return file["grids"]
+
+
+def write_changed(folder: Path, run: Run, names: Iterable[str], change: Callable[[np.ndarray], np.ndarray]) -> Path:
+    """Write what a run has learnt of some photographs, with other gains or grids. Returns the folder."""
+    folder.mkdir()
+    record = json.loads(run.appearance_path.read_text())
+    rows = {name: dict(record["photographs"][name]) for name in names}
+    if run.config.appearance == "grid":
+        np.savez(folder / "appearance.npz", grids=change(grids_of_run(run)).astype(np.float32))
+    else:
+        for row in rows.values():
+            row["log2_gains"] = change(np.array(row["log2_gains"])).tolist()
+    (folder / "appearance.json").write_text(json.dumps({**record, "photographs": rows}))
+    return folder
 
 
 def test_a_fixed_appearance_stays_and_the_model_learns(earlier: Run, scene: Scene, default_device: Device) -> None:
@@ -77,6 +98,29 @@ def test_a_fixed_appearance_stays_and_the_model_learns(earlier: Run, scene: Scen
     for name, value in now.items():
         assert_same_bits(value, known[name], name)
     assert (before.means != trainer.gaussians().means).any()
+
+
+def test_photographs_of_parts_begin_with_the_mean_of_theirs(
+    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path
+) -> None:
+    """The first part has learnt three photographs, and the second two of them otherwise; the others are the whole's."""
+    names, record = [view.name for view in scene.train_views], json.loads(earlier.appearance_path.read_text())
+    is_grid = earlier.config.appearance == "grid"
+    parts = (
+        write_changed(tmp_path / "a", earlier, names[:3], lambda values: 1.5 * values),
+        write_changed(tmp_path / "b", earlier, names[1:3], lambda values: 2.5 * values),
+    )
+    start = Start(earlier.model, appearance_of=earlier.path, appearance_parts=parts)
+    trainer = Trainer(scene, earlier.config, default_device, start)
+    now, known = photographs(trainer.appearance.record() or {}), record["photographs"]
+    for name, factor in zip(names, (1.5, 2.0, 2.0, *[1.0] * (len(names) - 3)), strict=True):
+        if is_grid:
+            found, wanted = values(trainer)[name], grids_of_run(earlier)[known[name]["grid"]]
+        else:
+            found, wanted = now[name]["log2_gains"], known[name]["log2_gains"]  # type: ignore[index]
+            assert {**now[name], "log2_gains": 0} == {**known[name], "log2_gains": 0}  # type: ignore[dict-item]
+        # the mean is one of float64, and rounded once
+        np.testing.assert_allclose(found, factor * np.asarray(wanted), rtol=1e-6, atol=1e-7)
 
 
 def test_the_loss_is_that_of_the_earlier_appearance(earlier: Run, scene: Scene, default_device: Device) -> None:
@@ -102,20 +146,52 @@ def test_an_appearance_goes_on_where_it_was(earlier: Run, scene: Scene, default_
     assert any((value != of_run(earlier)[name]).any() for name, value in values(trainer).items())
 
 
-@pytest.mark.parametrize("batch", [1, 2])
+def test_the_mean_of_some_photographs_stays(earlier: Run, scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    """The photographs of a block may all be brighter than the scene's. The block trains their differences alone."""
+    some = some_of(scene)
+    brighter = write_changed(
+        tmp_path / "brighter", earlier, [view.name for view in some.views], lambda values: values + 0.5
+    )
+    start = Start(earlier.model, appearance_of=brighter, trains_appearance=True)
+    trainer = Trainer(some, earlier.config, default_device, start)
+
+    def kept() -> np.ndarray:
+        record = photographs(trainer.appearance.record() or {})
+        rows = [row.get("log2_gains") for row in record.values()]  # type: ignore[attr-defined]
+        return np.array(list(values(trainer).values()) if None in rows else rows)
+
+    before = kept()
+    for _ in range(3 * len(before)):
+        trainer.train_step()
+    now = kept()
+    assert np.abs(now - before).max() > 1e-3
+    assert np.abs(before.mean(axis=0)).max() > 0.4
+    # roundings of float32 numbers below 2
+    np.testing.assert_allclose(now.mean(axis=0), before.mean(axis=0), rtol=0, atol=4e-7)
+
+
+@pytest.mark.parametrize(("batch", "trains"), [(1, False), (2, False), (1, True)])
 def test_a_resumed_training_has_the_same_bytes(
-    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path, batch: int
+    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path, batch: int, trains: bool
 ) -> None:
-    some, config = some_of(scene), replace(earlier.config, batch=batch)
-    start = Start(earlier.model, appearance_of=earlier.path)
-    whole = train(some, config, device=default_device, start=start)
-    run = Run.create(tmp_path / "run", replace(config, iterations=4))
-    train(some, replace(config, iterations=4), run=run, device=default_device, start=start)
-    resumed = train(some, config, run=Run.open(run.path), resume=True, device=default_device, start=start)
+    some, config = some_of(scene), replace(earlier.config, batch=batch, checkpoint_every=4)
+    start = Start(earlier.model, appearance_of=earlier.path, trains_appearance=trains)
+    runs = [Run.create(tmp_path / name, config) for name in ("whole", "run")]
+    whole = train(some, config, run=runs[0], device=default_device, start=start)
+
+    def stop(report: StepReport) -> None:
+        if report.step == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(some, config, run=runs[1], device=default_device, start=start, on_step=stop)
+    resumed = train(some, config, run=Run.open(runs[1].path), resume=True, device=default_device, start=start)
     for name, array in whole.arrays().items():
         assert_same_bits(resumed.arrays()[name], array, name)
-    for name, value in of_run(Run.open(run.path)).items():
-        assert_same_bits(value, of_run(earlier)[name], name)
+    learnt = of_run(Run.open(runs[0].path))
+    for name, value in of_run(Run.open(runs[1].path)).items():
+        assert_same_bits(value, learnt[name], name)
+        assert (value == of_run(earlier)[name]).all() != trains
 
 
 def test_what_is_missing_is_named(earlier: Run, scene: Scene, default_device: Device, tmp_path: Path) -> None:
@@ -136,3 +212,7 @@ def test_what_is_missing_is_named(earlier: Run, scene: Scene, default_device: De
     record["photographs"][name] = {"log2_gains": [0, "a", 1], "grid": -1}
     (tmp_path / "appearance.json").write_text(json.dumps(record))
     assert "expected a file that clsplat train --appearance writes" in begun(tmp_path)
+    alone = Start(earlier.model, appearance_parts=(earlier.path,))
+    assert "appearance_parts but no appearance_of" in refusal(
+        lambda: Trainer(scene, earlier.config, default_device, alone)
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiment of blocks: a scene whole and in blocks, its borders, their colours, and floaters."""
+"""The experiment of blocks: a scene whole and in blocks, its borders, and floaters."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
@@ -32,11 +32,9 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.training.start import Start
 
 BAND_METRES = 3.0
-"""Width, on each side of a border, of the band in which PSNR and colours are measured, in world units of the town."""
+"""Width, on each side of a border, of the band in which PSNR and colour are measured, in world units of the town."""
 EXTRA_STEPS = 1.05
 """Steps of the whole's training, as a multiple of --iterations, because the finish adds about as many to the blocks."""
-BESIDE_METRES = 9.0
-"""Distance of lines, beside the borders, across which colours are compared too: they tell what is no border."""
 LEAST_PIXELS = 200
 """Least number of pixels of a view in the band, or elsewhere, that count."""
 OUTSIDE_CAMERAS = 8
@@ -112,38 +110,6 @@ def psnrs(
     return [float(np.mean(values)) for values in found]
 
 
-def colour_steps(
-    renders: Sequence[Float32], clean: Sequence[Float32], ground: Sequence[Float64], borders: Sequence[Border]
-) -> list[float]:
-    """Steps of colour across borders, in levels of 1/255, as means over the channels.
-
-    clean: the photographs without changes of exposure. In the band of a border, a gain for each channel is taken out,
-        and the step is the difference between the mean errors on the border's sides.
-    """
-    steps = []
-    for border in borders:
-        sides: list[list[Float64]] = [[], []]
-        for image, photograph, places in zip(renders, clean, ground, strict=True):
-            distance = border.distances(places)
-            for side, mask in enumerate(
-                ((distance >= -BAND_METRES) & (distance < 0), (distance >= 0) & (distance < BAND_METRES))
-            ):
-                sides[side].append(np.stack([image[mask], photograph[mask]], axis=1).astype(np.float64))
-        low, high = (np.concatenate(parts) for parts in sides)
-        both = np.concatenate([low, high])
-        gain = (both[:, 0] * both[:, 1]).sum(axis=0) / np.square(both[:, 0]).sum(axis=0)
-        means = [(side[:, 0] * gain - side[:, 1]).mean(axis=0) for side in (low, high)]
-        steps.append(float(255 * np.abs(means[0] - means[1]).mean()))
-    return steps
-
-
-@contextmanager
-def own_appearance() -> Iterator[None]:
-    """Context in which blocks learn appearances of their own, in place of the coarse model's."""
-    with patch.object(block_training, "_with_appearance", lambda _coarse: None):
-        yield
-
-
 @contextmanager
 def no_surroundings() -> Iterator[None]:
     """Context in which blocks begin with the Gaussians of their widened cell alone, and train them everywhere."""
@@ -164,8 +130,8 @@ def no_surroundings() -> Iterator[None]:
         yield
 
 
-def town_of(given: Namespace, exposure: float) -> Path:
-    """Write the town, or take the one that is there."""
+def town_of(given: Namespace, exposure: float = 0.0) -> Path:
+    """Write the town, or take the one that is there. exposure: stops by which exposures drift (`--town-exposure`)."""
     folder: Path = given.folder / f"town-{exposure:g}"
     if not folder.exists():
         words = ["--town", given.town, "--town-photos", str(given.town_photos), "--town-size", given.town_size]
@@ -201,13 +167,13 @@ def models_of(city: Path) -> dict[str, Gaussians]:
 
 
 def blocks(given: Namespace) -> Rows:
-    """A town whole and in blocks: held-out PSNR, in a band along the borders and elsewhere; colours across the borders
-    with and without the coarse model's appearance; PSNR with and without frozen surroundings.
+    """A town whole and in blocks: held-out PSNR, in a band along the borders and elsewhere, with and without frozen
+    surroundings.
 
     The whole has as many steps as the blocks with their finish, and at most as many Gaussians.
     """
     renderer = Renderer(open_device())
-    town = town_of(given, 0.0)
+    town = town_of(given)
     settings = f"schedule=short,sky={given.sky},{given.settings}".rstrip(",")
     growth = f"density.growth=budget,density.max-gaussians={given.gaussians}"
     city = city_of(given, town, "frozen", f"{settings},{growth}")
@@ -237,8 +203,6 @@ def blocks(given: Namespace) -> Rows:
     shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
     save_pictures(given.folder / "pictures", scene, shares, photographs, pictures)
     yield from floaters(given, renderer, scene, {"frozen": city, "without": alone}, done.model)
-    if given.exposure:
-        yield from exposures(given, renderer, scene, f"{settings},{growth}")
     return 0
 
 
@@ -302,48 +266,3 @@ def from_outside(scene: Scene, plan: BlockPlan) -> list[Camera]:
         position = middle - forward * 1.3 * size
         cameras.append(Camera(320, 200, 260.0, 260.0, 160.0, 100.0, rotation, -rotation @ position))
     return cameras
-
-
-def exposures(given: Namespace, renderer: Renderer, scene: Scene, settings: str) -> Rows:
-    """Steps of colour across the borders of a town whose exposure drifts, and across lines beside them: of the whole
-    against the photographs, and of the blocks also against the whole, whose own errors then cancel."""
-    town = town_of(given, given.exposure)
-    settings = f"{settings},appearance=exposure"
-    city = city_of(given, town, "exposure", settings)
-    with own_appearance():
-        other = city_of(given, town, "exposure own", settings, planned=city)
-    whole = trained(given, "whole exposure", town, settings=settings, iterations=round(EXTRA_STEPS * given.iterations))
-    borders = borders_of(read_plan(city))
-    beside = [replace(border, at=border.at + side * BESIDE_METRES) for border in borders for side in (-1, 1)]
-
-    def drawn(model: Gaussians) -> list[Float32]:
-        return [renderer.render(model, view.camera).image for view in scene.views]
-
-    clean, of_whole = [view.load()[:, :, :3] for view in scene.views], drawn(whole.model)
-    yield (
-        "appearance of blocks",
-        "model",
-        "mean step of colour, levels",
-        "largest",
-        "beside the borders",
-        "against the whole: mean",
-        "largest",
-        "beside the borders",
-    )
-    ground = ground_of(renderer, whole.model, scene.views, read_plan(city))
-    shares = [float((from_borders(places, borders) <= BAND_METRES).mean()) for places in ground]
-    place = int(np.argmax(shares))
-    kinds = {"of the coarse model": city, "their own": other}
-    models = {(kind, name): model for kind, folder in kinds.items() for name, model in models_of(folder).items()}
-    for (kind, name), images in {
-        ("-", "whole"): of_whole,
-        **{key: drawn(model) for key, model in models.items()},
-    }.items():
-        cells = list[str]()
-        for judge in (clean, of_whole):
-            across, along = (colour_steps(images, judge, ground, lines) for lines in (borders, beside))
-            cells += [f"{value:.2f}" for value in (np.mean(across), max(across), np.mean(along))]
-        yield kind, name, *(cells[:3] if images is of_whole else cells)
-        file = f"{scene.views[place].name.replace('/', '-')}-{kind.replace(' ', '-')}-{name}.png"
-        write_image(given.folder / "pictures" / file, np.clip(images[place], 0, 1))
-    return 0

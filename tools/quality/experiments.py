@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from quality.blocks import blocks
+from quality.border_colours import border_colours
 from quality.camera_choices import cameras as sfm_cameras
 from quality.made_scenes import (
     Changes,
@@ -440,7 +441,10 @@ BLOCKS = {
     "--blocks": {"default": "2x2", "help": "as for `clsplat train`"},
     "--gaussians": _number(20_000, "largest number of Gaussians"),
     "--sky": _number(3000, "Gaussians of the sky"),
-    "--exposure": _number(0.0, "stops of the town whose exposure drifts; 0: no such town"),
+}
+BORDERS = {
+    "--exposure": _number(1.0, "stops of the town whose exposure drifts"),
+    "--exposed-blocks": {"action": "store_true", "help": "one exposure for each block of the town, instead of a drift"},
 }
 CAMERAS: dict[str, Any] = {
     "--choices": {"default": "auto", "help": "'matching=exhaustive,mapper=global;auto', with semicolons between"},
@@ -459,6 +463,7 @@ EXPERIMENTS = {
     "orders": Experiment(orders, "+", 3000, {**RESOLUTION, **WITH, **SEEDS}),
     "towns": Experiment(towns, 0, 0, {**WITH, **TOWNS}),
     "blocks": Experiment(blocks, 0, 4000, {**RESOLUTION, **WITH, **BLOCKS}),
+    "borders": Experiment(border_colours, 0, 4000, {**RESOLUTION, **WITH, **SEEDS, **BLOCKS, **BORDERS}),
     "sfm": Experiment(sfm_cameras, "+", 2000, {**RESOLUTION, **CAMERAS}),
     "formats": Experiment(
         survey_formats, 1, 1000, {**RESOLUTION, **WITH, "--bound": _number(0.05, "largest difference in dB")}

@@ -5,9 +5,9 @@
     .venv/bin/python tools/quality/run.py NAME FOLDER [SCENE...] [--iterations N] [--seed N] [--help]
     .venv/bin/python tools/quality/run.py tables SCENES -o FOLDER [--help]
 
-NAME is masks, exposure, fisheye, points, colours, poses, views, seeds, orders, towns, blocks, sfm, formats or units;
-`tables` makes all tables of the page. FOLDER gets the created scenes and the runs. They are reused, so that a call
-continues where an earlier one stopped. The tables are Markdown.
+NAME is masks, exposure, fisheye, points, colours, poses, views, seeds, orders, towns, blocks, borders, sfm, formats or
+units; `tables` makes all tables of the page. FOLDER gets the created scenes and the runs. They are reused, so that a
+call continues where an earlier one stopped. The tables are Markdown.
 """
 
 from __future__ import annotations

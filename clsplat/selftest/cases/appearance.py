@@ -192,11 +192,12 @@ def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Expected]
     by_entries[taken.photograph] = found[:count] + reference.pull(entries, start, pull)[taken.photograph]
     by_lenses[taken.lens] = found[count:]
     rates = given.rate * np.where(is_gain, 1.0, MIX_RATE_FACTOR)
-    after, first, second = reference.step(entries, of_entries[0], of_entries[1], by_entries, given.number, rates)
-    after[:, GAIN_ENTRIES:] = np.clip(after[:, GAIN_ENTRIES:], -MAX_MIX, MAX_MIX)
-    lenses, _, _ = reference.step(
-        lenses, of_lenses[0], of_lenses[1], by_lenses, given.number, given.rate, centred=False
+    mean = start.mean(axis=0)
+    after, first, second = reference.step(
+        entries, of_entries[0], of_entries[1], by_entries, given.number, rates, mean=mean
     )
+    after[:, GAIN_ENTRIES:] = np.clip(after[:, GAIN_ENTRIES:], -MAX_MIX, MAX_MIX)
+    lenses, _, _ = reference.step(lenses, of_lenses[0], of_lenses[1], by_lenses, given.number, given.rate)
     return {
         "target": _developed(model, given, squared),
         # the bound covers a few roundings of partial sums and of distances, relative to the sum of magnitudes

@@ -68,7 +68,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
 def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     image, held, by_seen, moments = given.wide("image", "grids", "by_seen", "moments")
     at, (first, second) = GRID_PHOTOGRAPH, moments
-    own = held[at].copy()
+    own, mean = held[at].copy(), held.mean(axis=0)
     seen, terms = reference.apply(image, own), reference.apply(np.abs(image), np.abs(own))
     by_image, by_grid = reference.gradient(image, own, by_seen)
     by_grid += given.weight * reference.variation_gradient(own)
@@ -77,7 +77,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     got |= {f"{name} of another": got[name][0] for name in ("first", "second")}
     held[at], first[at], second[at] = reference.step(own, first[at], second[at], *step)
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
-    centred = reference.centre(held)
+    centred = reference.centre(held, mean)
     return {
         "seen": Expected(seen, 1.2e-6, max(1.0, terms.max())),  # the bound covers about twelve roundings
         # the bound covers sums of a hundred terms with both signs

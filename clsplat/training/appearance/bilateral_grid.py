@@ -61,7 +61,7 @@ class ViewGrid(ViewPart):
         values: the grid on the host, as the method `values` returns it.
         """
         grids = upload(device, values)
-        return replace(self, device=device, grids=Grids(grids, grids, grids), view=0)
+        return replace(self, device=device, grids=Grids(grids, grids, grids, grids), view=0)
 
     def values(self) -> NDArray[np.float32]:
         """Return the photograph's grid on the host, for `on` to upload to another device."""
@@ -92,8 +92,8 @@ class ViewGrid(ViewPart):
         return by_grid
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the grid. After a pass through all views, also shift all grids so that their mean is the
-        identity: a colour change that all photographs share belongs to the model.
+        """Take Adam's step for the grid. After a pass through all views, also shift all grids so that their mean stays
+        that of the initial ones: a colour change that all photographs share belongs to the model.
 
         own: gradient with respect to the grid, as the method `gradient` returned it. None causes no step.
         readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
@@ -115,14 +115,15 @@ class GridsOfAll(Appearance):
         self._grids = Grids.on(device, np.ascontiguousarray(start))
         self._fixed = False
 
-    def begin_from(self, folder: Path, *, fixed: bool) -> None:
+    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
         """Begin with the grids that the run in `folder` has learnt, by the names of the photographs.
 
+        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs.
         fixed: True if the grids stay as they are.
         Raises InputError if the run has no grids of this size for all training photographs.
         """
         names = [view.name for view in self._scene.train_views]
-        self._grids, self._fixed = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE)), fixed
+        self._grids, self._fixed = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE, parts)), fixed
 
     @property
     def pixel_bytes(self) -> int:
@@ -172,4 +173,4 @@ class GridsOfAll(Appearance):
         """Load grids and moments from a checkpoint's arrays, by name without "appearance/". Raises ValueError for other
         photographs."""
         values = loaded(self._device, arrays, ("grids", "first", "second"), self._grids.grids.shape)
-        self._grids = Grids(**values)
+        self._grids = replace(self._grids, **values)

@@ -209,19 +209,23 @@ class ColoursOfAll(Appearance):
         self._earlier: NDArray[np.float32] | None = None
         self._fixed = False
 
-    def begin_from(self, folder: Path, *, fixed: bool) -> None:
+    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
         """Begin with the entries that the run in `folder` has learnt, by the names of the photographs.
 
+        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs,
+            and a lens with the mean of its photographs.
         fixed: True if the entries stay as they are.
         Raises InputError if the run has not learnt this colour model of all training photographs.
         """
         views, model = self._scene.train_views, self._model
-        own, of_lenses = entries_of(folder, [view.name for view in views], model)
+        own, of_lenses = entries_of(folder, [view.name for view in views], model, parts)
         self._earlier, self._fixed = own.astype(np.float32), fixed
         if self._lenses is not None:
-            values = np.zeros((len(self._lens_rows), model.lens_entries), np.float32)
-            values[[taken.lens for taken in self._taken]] = of_lenses
-            self._lenses = Gains.on(self._device, values)
+            lenses = np.array([taken.lens for taken in self._taken])
+            values = np.zeros((len(self._lens_rows), model.lens_entries))
+            np.add.at(values, lenses, of_lenses)
+            values /= np.maximum(np.bincount(lenses, minlength=len(values)), 1)[:, None]
+            self._lenses = Gains.on(self._device, values.astype(np.float32))
 
     @cached_property
     def _gains(self) -> Gains:
@@ -242,7 +246,9 @@ class ColoursOfAll(Appearance):
         start = np.zeros((len(scene.train_views), self._model.entries))
         start[:, :GAIN_ENTRIES] = [by_points.get(view.name, np.full(3, told)) for view, told in views]
         self._by_points = np.array([view.name in by_points for view in scene.train_views])
-        begun = Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), self._pull)
+        # The mean of `start` is what the training keeps. The pull does not depend on it.
+        mean = 0 if self._earlier is None else self._earlier.mean(axis=0, dtype=np.float64)
+        begun = Gains.on(self._device, (start - start.mean(axis=0) + mean).astype(np.float32), self._pull)
         if self._earlier is None:
             return begun
         earlier = Gains.on(self._device, self._earlier)
@@ -316,7 +322,7 @@ class ColoursOfAll(Appearance):
         spread = np.square(told[known]).sum()
         slopes = told[known] @ logs[known] / spread if spread > 0 else np.zeros(GAIN_ENTRIES)
         held_out = _from_mean([exposure_of(view.path) for view in self._scene.test_views], self._told)
-        expected: NDArray[np.float64] = np.nan_to_num(held_out)[:, None] * slopes
+        expected: NDArray[np.float64] = logs.mean(axis=0) + np.nan_to_num(held_out)[:, None] * slopes
         return expected
 
     def _of_lens(self, view: View, entries: NDArray[np.float64]) -> dict[str, list[float]]:
