@@ -14,13 +14,14 @@ from pathlib import Path
 
 from clsplat.blocks.block_scene import scene_of_block, scene_of_finish
 from clsplat.blocks.block_settings import block_settings, finish_settings
-from clsplat.blocks.merging import digests_of_blocks, merge_digest, merged_of, region_of_block
+from clsplat.blocks.merging import is_merged, merge_digest, merged_of, region_of_block
 from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, Block, BlockPlan, read_plan
 from clsplat.blocks.plan_check import check_plan
 from clsplat.blocks.progress_records import (
     BEGUN_FILE,
     CITY_FILES,
     DONE_FILE,
+    MERGED_APPEARANCE_FOLDER,
     MERGED_FILE,
     check_begun,
     is_done,
@@ -70,8 +71,8 @@ def train_block(city: Path, name: str, load: LoadScene, train: TrainRun, devices
         config = block_settings(plan, block, coarse.config, surroundings).on_devices(devices, explicit=False)
         run = Run.create(folder, config, scene=plan.scene, resume=is_run(folder), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "train", str(city), "--block", name])
-        train(part, run, Start(model, region, _with_appearance(coarse), trains_appearance=True))
-        keep_done(folder, plan.digest, plan.coarse)
+        train(part, run, Start(model, region, coarse.path if plan.settings.appearance != "none" else None))
+        keep_done(run, plan.digest, plan.coarse)
     return True
 
 
@@ -98,23 +99,17 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
         remove(city / DONE_FILE)  # of fewer steps: if it stayed, an interrupted training would count as finished
         run = Run.create(city, config, scene=plan.scene, resume=is_run(city), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "finish", str(city)])
-        learnt = _with_appearance(coarse)
-        parts = tuple(city / BLOCKS_FOLDER / block.name for block in plan.cells) if learnt is not None else ()
-        model = Gaussians.load(city / MERGED_FILE)
-        start = Start(model, None, learnt, trains_appearance=True, appearance_parts=parts)
+        learnt = city / MERGED_APPEARANCE_FOLDER if plan.settings.appearance != "none" else None
+        start = Start(Gaussians.load(city / MERGED_FILE), None, learnt)
         train(scene_of_finish(scene, plan, coarse), run, start)
         _copy_refined(coarse, run)
-        keep_done(city, plan.digest, merged)
+        keep_done(run, plan.digest, merged)
     return True
 
 
 def is_trained(city: Path, plan: BlockPlan, block: Block) -> bool:
     """True if the training of a block has finished. Raises InputError for a damaged record of it."""
-    folder = city / BLOCKS_FOLDER / block.name
-    if not is_done(folder, plan.digest):
-        return False
-    # the finish needs the appearance too, which may not have been copied with the model
-    return plan.settings.appearance == "none" or (folder / "appearance.json").exists()
+    return is_done(city / BLOCKS_FOLDER / block.name, plan.digest)
 
 
 def is_finished(city: Path, plan: BlockPlan, steps: int | None) -> bool:
@@ -123,7 +118,7 @@ def is_finished(city: Path, plan: BlockPlan, steps: int | None) -> bool:
     steps: number of steps that the finish must have; None for any number.
     """
     with suppress(ClsplatError):
-        merged = merge_digest(plan, digests_of_blocks(city, plan))
+        merged = merge_digest(city, plan)
         return is_done(city, plan.digest, merged) and steps in (None, Run.open(city).config.iterations)
     return False
 
@@ -138,11 +133,16 @@ def _steps(city: Path, plan: BlockPlan, asked: int | None) -> int:
 
 
 def _merged(city: Path, plan: BlockPlan) -> str:
-    """Return the digest of the merge in merged.ply. Raises InputError unless it has the models of all blocks."""
-    wanted, path = merge_digest(plan, digests_of_blocks(city, plan)), city / MERGED_FILE
-    if (found := merged_of(path)) != wanted:
-        what = "is missing" if not path.exists() else f"is a merge of other models ({str(found)[:12]})"
-        raise InputError(f"{path}: {what}, expected the merge of all blocks; run clsplat blocks merge {city}")
+    """Return the digest of the merge. Raises InputError unless it has the models and the appearances of all blocks."""
+    wanted, path = merge_digest(city, plan), city / MERGED_FILE
+    if not is_merged(city, plan):
+        if not path.exists():
+            what = f"{path}: is missing"
+        elif (found := merged_of(path)) != wanted:
+            what = f"{path}: is a merge of other models ({str(found)[:12]})"
+        else:
+            what = f"{city / MERGED_APPEARANCE_FOLDER}: lacks the merged appearance"
+        raise InputError(f"{what}, expected the merge of all blocks; run clsplat blocks merge {city}")
     return wanted
 
 
@@ -167,11 +167,6 @@ def _how_to_finish_anew(city: Path) -> str:
     names = [BEGUN_FILE, DONE_FILE, *sorted(name for name in parts - CITY_FILES if not name.startswith("."))]
     there = ", ".join(name for name in names if (city / name).exists())
     return f"to train the finish anew, remove from this folder: {there}"
-
-
-def _with_appearance(coarse: Run) -> Path | None:
-    """Folder of the run whose appearance is used; None if the settings learn no appearance."""
-    return coarse.path if coarse.config.appearance != "none" else None
 
 
 def _copy_refined(coarse: Run, run: Run) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The merge of the blocks' models: of each block, the Gaussians whose means lie in its own cell.
+"""The merge of the blocks: of each model, the Gaussians whose means lie in its own cell, and the mean appearance.
 
 Cells are half-open and cover the plane, so each place on the ground belongs to one block. Gaussians outside the cell of
 their block are left out, because another block has Gaussians of its own there.
@@ -16,8 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.plan import BLOCKS_FOLDER, Block, BlockPlan, read_plan
-from clsplat.blocks.progress_records import MERGED_FILE, done_record
+from clsplat.blocks.merged_appearance import mean_appearance
+from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, Block, BlockPlan, read_plan
+from clsplat.blocks.progress_records import (
+    DONE_FILE,
+    MERGED_APPEARANCE_FOLDER,
+    MERGED_FILE,
+    DoneRecord,
+    done_record,
+)
 from clsplat.errors import ClsplatError, InputError, examples
 from clsplat.files.documents import digest, open_input
 from clsplat.gaussians import Gaussians
@@ -25,6 +32,7 @@ from clsplat.images.colour import comment, recorded_space
 from clsplat.models.edit import take
 from clsplat.models.formats import ply
 from clsplat.optimisation.trained_region import TrainedRegion
+from clsplat.runs.run import Run
 
 MERGED_COMMENT = "clsplat merged"
 """Beginning of the comment in merged.ply that is followed by the digest of the plan and of the blocks' models."""
@@ -85,50 +93,56 @@ def _kind(model: Gaussians) -> tuple[object, ...]:
     return model.sh_degree, tuple(model.origin.tolist()), model.near, model.antialiased, model.by_rays
 
 
-def merge_digest(plan: BlockPlan, models: Sequence[str]) -> str:
-    """Return the digest of a merge, in hexadecimal. models: SHA-256 of each block's model file, in the plan's order."""
-    return hashlib.sha256("\n".join([plan.digest, *models]).encode()).hexdigest()
+def merge_digest(city: Path, plan: BlockPlan) -> str:
+    """Return the digest of the merge of all blocks, in hexadecimal. Raises InputError, as `records_of_blocks`."""
+    results = [record.result for record in records_of_blocks(city, plan)]
+    return hashlib.sha256("\n".join([plan.digest, *results]).encode()).hexdigest()
 
 
 def merge(city: Path) -> bool:
-    """Write merged.ply from the blocks' finished models. Returns False if it is there already.
+    """Write merged.ply from the blocks' finished models, and the merged appearance, if there is one. Returns False if
+    both are there already.
 
-    Raises InputError if a block is not finished, or its model has changed since.
+    Raises InputError if a block is not finished, or a file of its result has changed since.
     """
     plan = read_plan(city)
-    found = digests_of_blocks(city, plan)
-    wanted, target = merge_digest(plan, found), city / MERGED_FILE
-    if _has_merge(target, wanted):
+    if is_merged(city, plan):
         return False
-    models = []
-    for block, known in zip(plan.blocks, found, strict=True):
-        path = city / BLOCKS_FOLDER / block.name / "model.ply"
-        if digest(path) != known:
-            raise InputError(
-                f"{path}: is not the model that the block's training wrote; put it back, or remove "
-                f"{path.with_name('done.json')} and train the block again"
-            )
-        models.append(CellModel(path, region_of_block(plan, block)))
-    write_merged(target, models, [comment(recorded_space(models[0].path)), f"{MERGED_COMMENT} {wanted}"])
+    folders = {block.name: city / BLOCKS_FOLDER / block.name for block in plan.blocks}
+    for folder, record in zip(folders.values(), records_of_blocks(city, plan), strict=True):
+        _check_result(folder, record)
+    if plan.settings.appearance != "none":
+        # not of the sky's block, as the sky alone tells little about the exposure of a photograph
+        parts = [folders[block.name] for block in plan.cells]
+        found = mean_appearance(city / COARSE_FOLDER, parts, plan.settings.appearance)
+        (city / MERGED_APPEARANCE_FOLDER).mkdir(exist_ok=True)
+        Run(city / MERGED_APPEARANCE_FOLDER, plan.settings, plan.scene).write_appearance(*found)
+    models = [CellModel(folders[block.name] / "model.ply", region_of_block(plan, block)) for block in plan.blocks]
+    comments = [comment(recorded_space(models[0].path)), f"{MERGED_COMMENT} {merge_digest(city, plan)}"]
+    write_merged(city / MERGED_FILE, models, comments)
     return True
 
 
+def _check_result(folder: Path, record: DoneRecord) -> None:
+    """Raise InputError if a file of a block's result has changed since the block's training wrote it."""
+    for name, known in record.files.items():
+        if digest(folder / name) != known:
+            raise InputError(
+                f"{folder / name}: is not the file that the block's training wrote; put it back, or remove "
+                f"{folder / DONE_FILE} and train the block again"
+            )
+
+
 def is_merged(city: Path, plan: BlockPlan) -> bool:
-    """True if merged.ply has the finished models of all blocks."""
+    """True if merged.ply has the finished models of all blocks, and their merged appearance is there."""
+    learnt = Run(city / MERGED_APPEARANCE_FOLDER, plan.settings, plan.scene).result_files[1:]
     with suppress(ClsplatError):
-        return _has_merge(city / MERGED_FILE, merge_digest(plan, digests_of_blocks(city, plan)))
+        return merged_of(city / MERGED_FILE) == merge_digest(city, plan) and all(file.exists() for file in learnt)
     return False
 
 
-def _has_merge(path: Path, wanted: str) -> bool:
-    """True if the merge with the digest `wanted` wrote a file; False also for a file with a damaged header."""
-    with suppress(InputError):
-        return merged_of(path) == wanted
-    return False
-
-
-def digests_of_blocks(city: Path, plan: BlockPlan) -> list[str]:
-    """Return the SHA-256 of each finished block's model file, in the plan's order.
+def records_of_blocks(city: Path, plan: BlockPlan) -> list[DoneRecord]:
+    """Return the records of the finished blocks, in the plan's order.
 
     Raises InputError if blocks are not finished, or were trained by another plan.
     """
@@ -138,7 +152,7 @@ def digests_of_blocks(city: Path, plan: BlockPlan) -> list[str]:
         if record is None or record.plan != plan.digest:
             missing.append(block.shown)
         else:
-            found.append(record.model)
+            found.append(record)
     if missing:
         raise InputError(
             f"{city}: {len(missing)} of {len(plan.blocks)} blocks are not finished ({examples(missing)}); run "

@@ -139,9 +139,7 @@ def check_coarse(coarse: Run, wanted: TrainConfig, scene: Scene, config: TrainCo
 
 def _has_results(coarse: Run) -> bool:
     """True if a run has all files that the blocks read, of which a stopped training may have written only some."""
-    wanted = [coarse.model_path]
-    if coarse.config.appearance != "none":
-        wanted.append(coarse.appearance_path)
+    wanted = coarse.result_files
     if coarse.config.refines:
         wanted += [coarse.refined_path / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
     return all(path.exists() for path in wanted)

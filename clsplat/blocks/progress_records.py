@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -13,13 +14,18 @@ from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import digest, load_document
 from clsplat.report import PLAN_PICTURE_FILE
+from clsplat.runs.run import Run
 
 BEGUN_FILE, DONE_FILE = "begun.json", "done.json"
 """Names of the records in a run's folder: of the start of a training, and of its end."""
-MERGED_FILE, JOBS_FOLDER = "merged.ply", "jobs"
-"""Names of the merged model, and of the folder for claims and logs of tasks, in a city's folder."""
+MERGED_FILE, MERGED_APPEARANCE_FOLDER, JOBS_FOLDER = "merged.ply", "merged", "jobs"
+"""Names of the merged model, of the folder with the photographs' merged appearance, and of the folder for claims and
+logs of tasks, in a city's folder."""
 CITY_FILES = frozenset(
-    {PLAN_FILE, PLAN_PICTURE_FILE, COARSE_FOLDER, BLOCKS_FOLDER, MERGED_FILE, JOBS_FOLDER, BEGUN_FILE, DONE_FILE}
+    {
+        *(PLAN_FILE, PLAN_PICTURE_FILE, COARSE_FOLDER, BLOCKS_FOLDER, MERGED_FILE, MERGED_APPEARANCE_FOLDER),
+        *(JOBS_FOLDER, BEGUN_FILE, DONE_FILE),
+    }
 )
 """Names of files and folders in a city's folder, beside those of the run that is the finish."""
 _EXPECTED_RECORD = "a record that clsplat blocks wrote"
@@ -31,12 +37,17 @@ class DoneRecord:
 
     plan: digest of the plan (`BlockPlan.digest`).
     start: SHA-256 of the model that the training began with.
-    model: SHA-256 of the trained model's file.
+    files: SHA-256 of each file of the result (`Run.result_files`), by its name.
     """
 
     plan: str
     start: str
-    model: str
+    files: Mapping[str, str]
+
+    @property
+    def result(self) -> str:
+        """SHA-256 of the result: of the names and the digests of its files."""
+        return hashlib.sha256("\n".join(f"{name} {known}" for name, known in self.files.items()).encode()).hexdigest()
 
 
 def check_begun(run: Path, plan: str, start: str, advice: Callable[[], str]) -> None:
@@ -59,25 +70,29 @@ def check_begun(run: Path, plan: str, start: str, advice: Callable[[], str]) -> 
             )
 
 
-def keep_done(run: Path, plan: str, start: str) -> None:
-    """Write done.json for the finished training in the folder `run`. plan, start: as for `DoneRecord`."""
-    record = DoneRecord(plan, start, digest(run / "model.ply"))
-    atomic_write(run / DONE_FILE, (json.dumps({"clsplat_block": 1, **asdict(record)}) + "\n").encode())
+def keep_done(run: Run, plan: str, start: str) -> None:
+    """Write done.json for a finished training. plan, start: as for `DoneRecord`."""
+    record = DoneRecord(plan, start, {file.name: digest(file) for file in run.result_files})
+    atomic_write(run.path / DONE_FILE, (json.dumps({"clsplat_block": 1, **asdict(record)}) + "\n").encode())
 
 
 def done_record(run: Path) -> DoneRecord | None:
-    """Return the record of a finished training; None if it has not finished, or its model is missing.
+    """Return the record of a finished training; None if it has not finished, or a file of its result is missing.
 
     Raises InputError for a damaged record.
     """
     path = run / DONE_FILE
-    if not path.exists() or not (run / "model.ply").exists():
+    if not path.exists():
         return None
     record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
-    texts = [record.get(name) for name in ("plan", "start", "model")]
+    files = record.get("files")
+    digests = files if isinstance(files, dict) else {}
+    texts = [record.get("plan"), record.get("start"), digests.get("model.ply"), *digests.values()]
     if not all(isinstance(text, str) for text in texts):
         raise InputError(f"{path}: is damaged, expected {_EXPECTED_RECORD}; remove it, and train the block again")
-    return DoneRecord(*map(str, texts))
+    if not all((run / name).exists() for name in digests):
+        return None
+    return DoneRecord(str(record["plan"]), str(record["start"]), digests)
 
 
 def is_done(run: Path, plan: str, start: str | None = None) -> bool:

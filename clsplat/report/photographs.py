@@ -80,7 +80,7 @@ def exposure_chart(run: Run) -> Markup:
         ChartSeries(name, [(float(place), row[channel]) for place, row in enumerate(rows, 1)], color=color)
         for channel, (name, color) in enumerate((("red", 1), ("green", 2), ("blue", 0)))
     ]
-    note = "log2 of the factors of the model's colours; +1 is twice as bright as the mean" + corners
+    note = "log2 of the factors of the model's colours; +1 is twice as bright as the model" + corners
     return chart(
         "Exposure of the photographs", series, "training photographs in the order of names", "gain, stops", note=note
     )

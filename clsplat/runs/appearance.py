@@ -7,18 +7,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.config.colour_models import ColourModel
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import parse_json, read_document
 from clsplat.images.alpha import Image
-from clsplat.runs.run import Run, run_of
+from clsplat.runs.run import APPEARANCE_FILE, Run, run_of
 
 MAX_APPEARANCE_BYTES = 1 << 28
 """Maximum size of appearance.json in bytes."""
@@ -34,7 +33,6 @@ EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
 MAX_CENTRE_PICTURE_SIZES = 100.0
 """Limit of the magnitude of a vignette centre's coordinates, in picture widths and heights."""
 
-AnyFloats = TypeVar("AnyFloats", Float32, Float64)
 Row = Mapping[str, Any]
 """Entry of one photograph in appearance.json, parsed by `_row`."""
 Look = Callable[[str, Image], Image]
@@ -48,7 +46,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
     model: the run's folder, or a file in it.
     photograph: its name in the data set, with or without leading folders and extension.
     Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix. The gains of a held-out
-    photograph follow from its EXIF exposure, or are 1; its channels do not mix. Raises InputError.
+    photograph follow from its EXIF exposure, or are the mean; its channels do not mix. Raises InputError.
     """
     run = run_of(model)
     path = run.appearance_path if run is not None else None
@@ -98,26 +96,13 @@ def held_out_looks(record: Mapping[str, Any] | None) -> Look:
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 
 
-def entries_of(
-    folder: Path, names: Sequence[str], model: ColourModel, parts: Sequence[Path] = ()
-) -> tuple[Float64, Float64]:
+def entries_of(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Float64, Float64]:
     """Return the appearance that the run in `folder` has learnt: the entries of photographs and of lenses.
 
     names: the photographs' names.
-    parts: folders of runs of parts of the scene. Photographs that they have learnt get the means of their entries.
     Returns arrays (photographs, model.entries) and (photographs, model.lens_entries). Raises InputError.
     """
-    own, of_lenses = _entries(folder, names, model)
-    found = [(rows, _entries(part, some, model)) for part, rows, some in _learnt_by(parts, model.stem, names)]
-    return (
-        _means(own, [(rows, tables[0]) for rows, tables in found]),
-        _means(of_lenses, [(rows, tables[1]) for rows, tables in found]),
-    )
-
-
-def _entries(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Float64, Float64]:
-    """Return the entries of photographs and of lenses, as `entries_of`, of one run."""
-    path, record = _learnt(folder, model.stem, names)
+    path, record = folder / APPEARANCE_FILE, learnt_of(folder, model.stem, names)
     try:
         rows = [record["photographs"][name] for name in names]
         tables = [
@@ -134,58 +119,34 @@ def _entries(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[Fl
     return tables[0], tables[1]
 
 
-def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...], parts: Sequence[Path] = ()) -> Float32:
+def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...] | None = None) -> Float32:
     """Return the bilateral grids (photographs, *shape) that the run in `folder` has learnt of photographs.
 
-    names: the photographs' names. parts: as for `entries_of`. Raises InputError.
+    names: the photographs' names.
+    shape: the expected shape of a grid; None for any.
+    Raises InputError.
     """
-    found = [(rows, _grids(part, some, shape)) for part, rows, some in _learnt_by(parts, "grid", names)]
-    return _means(_grids(folder, names, shape), found)
-
-
-def _learnt_by(
-    parts: Sequence[Path], kind: str, names: Sequence[str]
-) -> list[tuple[Path, NDArray[np.int64], list[str]]]:
-    """Return, for each folder, the indices in `names` of the photographs that its run has learnt, and their names."""
-    found = []
-    for part in parts:
-        _, record = _learnt(part, kind, ())
-        rows = np.array([row for row, name in enumerate(names) if name in record["photographs"]], np.int64)
-        if rows.size:
-            found.append((part, rows, [names[row] for row in rows]))
-    return found
-
-
-def _means(whole: AnyFloats, parts: Sequence[tuple[NDArray[np.int64], AnyFloats]]) -> AnyFloats:
-    """Return `whole` (photographs, ...) with the means over parts, each (rows, values), in the rows that parts have."""
-    sums, counts = np.zeros(whole.shape), np.zeros(len(whole))
-    for rows, values in parts:
-        sums[rows] += values
-        counts[rows] += 1
-    result, has = whole.copy(), counts > 0
-    result[has] = sums[has] / counts[has].reshape(-1, *[1] * (whole.ndim - 1))
-    return result
-
-
-def _grids(folder: Path, names: Sequence[str], shape: tuple[int, ...]) -> Float32:
-    """Return the grids, as `grids_of`, of one run."""
-    path, record = _learnt(folder, "grid", names)
-    arrays = path.with_suffix(".npz")
+    record, arrays = learnt_of(folder, "grid", names), (folder / APPEARANCE_FILE).with_suffix(".npz")
     try:
         rows = [int(record["photographs"][name]["grid"]) for name in names]
         with np.load(arrays, allow_pickle=False) as file:
             grids = file["grids"]
-        if grids.shape[1:] != shape or grids.dtype != np.float32 or not np.isfinite(grids).all() or min(rows) < 0:
+        shape = grids.shape[1:] if shape is None else shape
+        is_right = grids.shape[1:] == shape and grids.dtype == np.float32 and min(rows, default=0) >= 0
+        if not (is_right and np.isfinite(grids).all()):
             raise ValueError(f"grids have shape {grids.shape}, expected finite float32 of (photographs, *{shape})")
         return np.ascontiguousarray(grids[rows])
     except (ValueError, TypeError, KeyError, IndexError, OSError, BadZipFile, OverflowError) as error:
         raise _misread(arrays, error) from None
 
 
-def _learnt(folder: Path, kind: str, names: Sequence[str]) -> tuple[Path, Any]:
-    """Return path and content of a run's appearance.json. Raises InputError if it is of another kind, or lacks
-    photographs."""
-    path = folder / "appearance.json"
+def learnt_of(folder: Path, kind: str, names: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the content of appearance.json in `folder`, which has a dictionary "photographs".
+
+    kind: the setting `appearance` of the run that wrote the file. names: photographs that the file must have.
+    Raises InputError if the file is missing, of another kind, or lacks photographs.
+    """
+    path = folder / APPEARANCE_FILE
     if not path.exists():
         raise InputError(f"{path}: no such file, expected a finished run of clsplat train --appearance {kind}")
     record = _document(path)
@@ -194,7 +155,7 @@ def _learnt(folder: Path, kind: str, names: Sequence[str]) -> tuple[Path, Any]:
         raise InputError(f"{path}: is of --appearance {was}, expected --appearance {kind}")
     if missing := [name for name in names if name not in record["photographs"]]:
         raise InputError(f"{path}: lacks {len(missing)} of {len(names)} photographs ({examples(missing)})")
-    return path, record
+    return record
 
 
 def _looks(rows: Mapping[str, Row]) -> Look:

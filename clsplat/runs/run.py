@@ -43,6 +43,8 @@ from clsplat.scenes.geography.georeference import GEOREFERENCE_FILE
 from clsplat.scenes.orientation.frame_record import FRAME_RECORD_FILE, read_frame
 from clsplat.scenes.sfm.video_frames import reconstruction_folder
 
+APPEARANCE_FILE = "appearance.json"
+"""Name of the file with the photographs' learnt appearance, in a run's folder."""
 KEPT_CHECKPOINTS = 2
 """Number of latest checkpoints that a run keeps."""
 SCRATCH_SUFFIX = ".chunks"
@@ -67,7 +69,7 @@ class Run:
         self.model_path = path / "model.ply"
         self.metrics_path = path / "metrics.jsonl"
         self.eval_path = path / "eval.json"
-        self.appearance_path = path / "appearance.json"
+        self.appearance_path = path / APPEARANCE_FILE
         self.depth_path = path / "depth"
         self.refined_path = path / "refined"
         self.checkpoints_path = path / "checkpoints"
@@ -195,6 +197,16 @@ class Run:
             with atomic_writer(self.appearance_path.with_suffix(".npz")) as file:
                 np.savez(file, **dict[str, Any](tables))
         atomic_write(self.appearance_path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
+
+    @property
+    def result_files(self) -> list[Path]:
+        """Files of the trained model and of the learnt appearance, which a finished training has written."""
+        files = [self.model_path]
+        if self.config.appearance != "none":
+            files.append(self.appearance_path)
+        if self.config.appearance == "grid":
+            files.append(self.appearance_path.with_suffix(".npz"))
+        return files
 
     def model_record(self) -> dict[str, Any]:
         """Return a record with the `step` and `seconds` of model.ply; empty if they are not known.
@@ -402,7 +414,7 @@ def owned_files(path: Path) -> list[Path]:
         "**/.*" + TEMPORARY_SUFFIX,
     )
     # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.
-    learnt = ("appearance.json", "appearance.npz")
+    learnt = (APPEARANCE_FILE, "appearance.npz")
     records = ("eval.json", *learnt, "report.html", FRAME_RECORD_FILE, GEOREFERENCE_FILE, "scene.json")
     names = ("model.ply", "metrics.jsonl", *records, "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
+_SUMMED_PHOTOGRAPHS = 256
+"""Photographs whose changes a work-item sums: SUMMED in appearance.cl."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class Gains:
     start: initial values of `logs`.
     first, second: Adam's moments.
     gains: 2^logs.
-    moved: scratch array for the update.
+    moved, changes: scratch arrays for the update.
     begins: (photographs + 1,), row starts of a sparse matrix, as in SciPy's `csr_array`. The matrix times `logs -
     start` is added to the gradient, which pulls the gains towards their initial values.
     others, weights: (n,), column indices and values of this matrix.
@@ -89,6 +91,7 @@ class Gains:
     second: DeviceArray
     gains: DeviceArray
     moved: DeviceArray
+    changes: DeviceArray
     begins: DeviceArray
     others: DeviceArray
     weights: DeviceArray
@@ -99,8 +102,15 @@ class Gains:
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
         held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))
-        moved = allocate(device, logs.shape, np.float32)
-        return cls(held, start, first, second, factors, moved, **rows_on(device, len(logs), pull))
+        return cls(
+            held, start, first, second, factors, **scratch_on(device, logs.shape), **rows_on(device, len(logs), pull)
+        )
+
+
+def scratch_on(device: Device, shape: tuple[int, ...]) -> dict[str, DeviceArray]:
+    """Allocate the scratch arrays of `Gains`. shape: shape of `Gains.logs`."""
+    sums = (-(-shape[0] // _SUMMED_PHOTOGRAPHS), shape[1])
+    return {name: allocate(device, each, np.float32) for name, each in (("moved", shape), ("changes", sums))}
 
 
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
@@ -206,5 +216,9 @@ def step_gains(
     matrix = (gains.begins, gains.others, gains.weights)
     read = (readback, columns, gains.start, *matrix, gains.logs)
     launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)
-    settled = (gains.start, gains.moved, gains.logs, gains.gains)
-    launch_items(device, kernels.centre_gains, count, count, width, int(entries.centred), readback, *settled)
+    groups = gains.changes.shape[0] if entries.centred else 0
+    if groups:
+        changed = (gains.start, gains.moved, gains.changes)
+        launch_grid(device, kernels.change_sums, (width, groups), count, width, *changed)
+    settled = (gains.changes, gains.moved, gains.logs, gains.gains)
+    launch_items(device, kernels.centre_gains, count, count, width, groups, readback, *settled)

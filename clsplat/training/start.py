@@ -25,19 +25,14 @@ class Start:
     model: the initial Gaussians. None makes them from the scene's points.
     region: the region in which the training changes Gaussians. None means everywhere. `train` leaves
         pixels that show frozen Gaussians out of the loss (`training.region_masks`).
-    appearance_of: folder of a run whose appearance is used for photographs of the same name, and is not trained. None
-        means that the training has an appearance of its own.
-    trains_appearance: True to train the appearance from where `appearance_of` has it. The mean over the photographs
-        stays what it is at the start.
-    appearance_parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of
-        their appearances, in place of that of `appearance_of`.
+    appearance_of: folder with the appearance.json (and appearance.npz) of an earlier training, whose appearance the
+        photographs of the same names begin with. Its mean over the photographs stays. None begins as if nothing
+        had been learnt.
     """
 
     model: Gaussians | None = None
     region: TrainedRegion | None = None
     appearance_of: Path | None = None
-    trains_appearance: bool = False
-    appearance_parts: tuple[Path, ...] = ()
 
 
 NO_START = Start()
@@ -49,8 +44,11 @@ def check_start(start: Start, config: TrainConfig) -> None:
     if not isinstance(start, Start):
         raise InputError(f"start is {start!r:.100}, expected Start(model=..., region=...)")
     model, region = start.model, start.region
-    if start.appearance_parts and start.appearance_of is None:
-        raise InputError("start has appearance_parts but no appearance_of, expected the run of the whole scene as well")
+    if start.appearance_of is not None and config.appearance == "none":
+        raise InputError(
+            f"start: has appearance_of={str(start.appearance_of)!r}, and the settings learn no appearance; expected "
+            "the setting `appearance` of that training"
+        )
     if region is not None and model is None:
         raise InputError("start has a region but no model, expected the model whose Gaussians the region selects")
     if region is not None and config.refines:

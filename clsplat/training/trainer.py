@@ -108,8 +108,7 @@ class Trainer:
         initial = self.begins_with.model or from_scene(self.scene, self.config.random_points, self.position.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
         if (earlier := self.begins_with.appearance_of) is not None:
-            begun = self.begins_with
-            self.appearance.begin_from(earlier, begun.appearance_parts, fixed=not begun.trains_appearance)
+            self.appearance.begin_from(earlier)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near, region = initial.origin, self.scene.near, self.begins_with.region
         self.region = None if region is None else region.relative_to(self.origin)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refusal
 from small_city import FINISH_STEPS, WHOLE, load, trains_on, write_city
 
 from clsplat.blocks.block_training import finish, train_block
@@ -53,7 +54,7 @@ def gains(run: Path) -> dict[str, object]:
 
 
 def test_blocks_and_finish_go_on_with_the_appearance(refined: Path, tmp_path: Path) -> None:
-    """Blocks begin with the coarse model's, and the finish with the means of the blocks'. All train it."""
+    """Blocks begin with the coarse model's, and the finish with the merged one."""
     city, starts = shutil.copytree(refined, tmp_path / "city"), list[Start]()
 
     def stop(_scene: Scene, _run: Run, start: Start) -> None:
@@ -66,9 +67,7 @@ def test_blocks_and_finish_go_on_with_the_appearance(refined: Path, tmp_path: Pa
     with pytest.raises(KeyboardInterrupt):
         train_block(city, "0,0", load(), stop)
     last, block = starts
-    assert block.appearance_of == last.appearance_of == city / "coarse"
-    assert (block.trains_appearance, last.trains_appearance) == (True, True)
-    assert (block.appearance_parts, last.appearance_parts) == ((), (city / "blocks" / "0_0", city / "blocks" / "1_0"))
+    assert (block.appearance_of, last.appearance_of) == (city / "coarse", city / "merged")
 
 
 def test_all_photographs_of_a_block_get_an_appearance(refined: Path) -> None:
@@ -107,8 +106,6 @@ def test_the_evaluation_of_the_city_sees_through_the_refined_lenses(refined: Pat
 
 
 def test_a_city_without_the_learnt_appearance_is_refused(refined: Path, tmp_path: Path, default_device: Device) -> None:
-    from calls import refusal
-
     city = shutil.copytree(refined, tmp_path / "city")
     (city / "coarse" / "appearance.json").unlink()
     (city / "blocks" / "0_0" / "done.json").unlink()
@@ -118,19 +115,51 @@ def test_a_city_without_the_learnt_appearance_is_refused(refined: Path, tmp_path
     )
 
 
+def test_the_merged_appearance_is_the_mean_of_the_blocks(refined: Path) -> None:
+    coarse, merged = gains(refined / "coarse"), gains(refined / "merged")
+    blocks = [gains(refined / "blocks" / name) for name in ("0_0", "1_0")]
+    assert merged.keys() == coarse.keys()
+    assert any(name in blocks[0] and name in blocks[1] for name in merged)
+    for name, row in merged.items():
+        found = [block[name]["log2_gains"] for block in blocks if name in block]  # type: ignore[index]
+        wanted = np.mean(found, axis=0).tolist() if found else coarse[name]["log2_gains"]  # type: ignore[index]
+        assert row == {"log2_gains": wanted}
+
+
 def test_a_block_without_its_appearance_is_trained_again(refined: Path, tmp_path: Path, default_device: Device) -> None:
     """As when someone has copied the models of blocks alone."""
-    from calls import refusal
-
     city = shutil.copytree(refined, tmp_path / "city")
     learnt = city / "blocks" / "0_0" / "appearance.json"
     content = learnt.read_bytes()
     assert not train_block(city, "0,0", load(), trains_on(default_device))
     learnt.unlink()
-    said = refusal(lambda: finish(city, FINISH_STEPS + 1, load(), trains_on(default_device)))
-    assert "0_0/appearance.json: no such file, expected a finished run of clsplat train --appearance exposure" in said
+    for call in (lambda: merge(city), lambda: finish(city, FINISH_STEPS + 1, load(), trains_on(default_device))):
+        assert "1 of 2 blocks are not finished (0,0); run clsplat blocks train" in refusal(call)
+    assert (city / "done.json").exists()
     assert train_block(city, "0,0", load(), trains_on(default_device))
     assert learnt.read_bytes() == content
+    assert not merge(city)
+
+
+def test_the_merged_appearance_is_missing_or_a_blocks_has_changed(
+    refined: Path, tmp_path: Path, default_device: Device
+) -> None:
+    city = shutil.copytree(refined, tmp_path / "city")
+    merged, block = city / "merged" / "appearance.json", city / "blocks" / "1_0" / "appearance.json"
+    content = merged.read_bytes()
+    merged.unlink()
+    said = refusal(lambda: finish(city, FINISH_STEPS + 1, load(), trains_on(default_device)))
+    assert (
+        f"merged: lacks the merged appearance, expected the merge of all blocks; run clsplat blocks merge {city}"
+        in said
+    )
+    assert merge(city)
+    assert merged.read_bytes() == content
+    merged.unlink()
+    block.write_bytes(block.read_bytes().replace(b"0.", b"1.", 1))
+    assert "1_0/appearance.json: is not the file that the block's training wrote; put it back" in refusal(
+        lambda: merge(city)
+    )
 
 
 def test_the_city_has_the_refined_cameras_and_their_place(refined: Path) -> None:

@@ -205,7 +205,7 @@ def test_changed_models_are_refused(done_city: Path, tmp_path: Path, default_dev
     whole = model.read_bytes()
     model.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     (city / "merged.ply").unlink()
-    assert f"{model}: is not the model that the block's training wrote" in refusal(lambda: merge(city))
+    assert f"{model}: is not the file that the block's training wrote" in refusal(lambda: merge(city))
     model.write_bytes(whole)
     assert "merged.ply: is missing, expected the merge" in refusal(
         lambda: finish(city, None, load(), trains_on(default_device))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training that begins with the appearance of an earlier run, and keeps it or trains it."""
+"""A training that begins with the appearance of an earlier run."""
 
 from __future__ import annotations
 
@@ -87,57 +87,21 @@ def write_changed(folder: Path, run: Run, names: Iterable[str], change: Callable
     return folder
 
 
-def test_a_fixed_appearance_stays_and_the_model_learns(earlier: Run, scene: Scene, default_device: Device) -> None:
-    some, config = some_of(scene), earlier.config
-    trainer = Trainer(some, config, default_device, Start(earlier.model, appearance_of=earlier.path))
-    before = trainer.gaussians()
-    for _ in range(6):
-        trainer.train_step()
-    now, known = values(trainer), of_run(earlier)
-    assert set(now) == {view.name for view in some.train_views}
-    for name, value in now.items():
-        assert_same_bits(value, known[name], name)
-    assert (before.means != trainer.gaussians().means).any()
-
-
-def test_photographs_of_parts_begin_with_the_mean_of_theirs(
-    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path
-) -> None:
-    """The first part has learnt three photographs, and the second two of them otherwise; the others are the whole's."""
-    names, record = [view.name for view in scene.train_views], json.loads(earlier.appearance_path.read_text())
-    is_grid = earlier.config.appearance == "grid"
-    parts = (
-        write_changed(tmp_path / "a", earlier, names[:3], lambda values: 1.5 * values),
-        write_changed(tmp_path / "b", earlier, names[1:3], lambda values: 2.5 * values),
-    )
-    start = Start(earlier.model, appearance_of=earlier.path, appearance_parts=parts)
-    trainer = Trainer(scene, earlier.config, default_device, start)
-    now, known = photographs(trainer.appearance.record() or {}), record["photographs"]
-    for name, factor in zip(names, (1.5, 2.0, 2.0, *[1.0] * (len(names) - 3)), strict=True):
-        if is_grid:
-            found, wanted = values(trainer)[name], grids_of_run(earlier)[known[name]["grid"]]
-        else:
-            found, wanted = now[name]["log2_gains"], known[name]["log2_gains"]  # type: ignore[index]
-            assert {**now[name], "log2_gains": 0} == {**known[name], "log2_gains": 0}  # type: ignore[dict-item]
-        # the mean is one of float64, and rounded once
-        np.testing.assert_allclose(found, factor * np.asarray(wanted), rtol=1e-6, atol=1e-7)
-
-
 def test_the_loss_is_that_of_the_earlier_appearance(earlier: Run, scene: Scene, default_device: Device) -> None:
     """The first step's loss is the earlier training's with the same model and view, not that of plain photographs."""
     one = replace(scene, views=scene.train_views[2:3])
     config = earlier.config
     start = Start(earlier.model, appearance_of=earlier.path)
-    kept = Trainer(one, config, default_device, start).train_step(reads_loss=True).read()[0]
-    plain = Trainer(one, replace(config, appearance="none"), default_device, earlier.model)
-    plain_loss = plain.train_step(reads_loss=True).read()[0]
-    trained = Trainer(one, config, default_device, replace(start, trains_appearance=True))
-    assert kept == trained.train_step(reads_loss=True).read()[0]
-    assert kept != plain_loss
+    begun = Trainer(one, config, default_device, start).train_step(reads_loss=True).read()[0]
+    fresh, plain = (
+        Trainer(one, other, default_device, earlier.model).train_step(reads_loss=True).read()[0]
+        for other in (config, replace(config, appearance="none"))
+    )
+    assert begun not in (fresh, plain)
 
 
 def test_an_appearance_goes_on_where_it_was(earlier: Run, scene: Scene, default_device: Device) -> None:
-    start = Start(earlier.model, appearance_of=earlier.path, trains_appearance=True)
+    start = Start(earlier.model, appearance_of=earlier.path)
     trainer = Trainer(scene, earlier.config, default_device, start)
     for name, value in values(trainer).items():
         assert_same_bits(value, of_run(earlier)[name], name)
@@ -152,7 +116,7 @@ def test_the_mean_of_some_photographs_stays(earlier: Run, scene: Scene, default_
     brighter = write_changed(
         tmp_path / "brighter", earlier, [view.name for view in some.views], lambda values: values + 0.5
     )
-    start = Start(earlier.model, appearance_of=brighter, trains_appearance=True)
+    start = Start(earlier.model, appearance_of=brighter)
     trainer = Trainer(some, earlier.config, default_device, start)
 
     def kept() -> np.ndarray:
@@ -170,12 +134,12 @@ def test_the_mean_of_some_photographs_stays(earlier: Run, scene: Scene, default_
     np.testing.assert_allclose(now.mean(axis=0), before.mean(axis=0), rtol=0, atol=4e-7)
 
 
-@pytest.mark.parametrize(("batch", "trains"), [(1, False), (2, False), (1, True)])
+@pytest.mark.parametrize("batch", [1, 2])
 def test_a_resumed_training_has_the_same_bytes(
-    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path, batch: int, trains: bool
+    earlier: Run, scene: Scene, default_device: Device, tmp_path: Path, batch: int
 ) -> None:
     some, config = some_of(scene), replace(earlier.config, batch=batch, checkpoint_every=4)
-    start = Start(earlier.model, appearance_of=earlier.path, trains_appearance=trains)
+    start = Start(earlier.model, appearance_of=earlier.path)
     runs = [Run.create(tmp_path / name, config) for name in ("whole", "run")]
     whole = train(some, config, run=runs[0], device=default_device, start=start)
 
@@ -191,7 +155,7 @@ def test_a_resumed_training_has_the_same_bytes(
     learnt = of_run(Run.open(runs[0].path))
     for name, value in of_run(Run.open(runs[1].path)).items():
         assert_same_bits(value, learnt[name], name)
-        assert (value == of_run(earlier)[name]).all() != trains
+        assert (value != of_run(earlier)[name]).any()
 
 
 def test_what_is_missing_is_named(earlier: Run, scene: Scene, default_device: Device, tmp_path: Path) -> None:
@@ -212,7 +176,6 @@ def test_what_is_missing_is_named(earlier: Run, scene: Scene, default_device: De
     record["photographs"][name] = {"log2_gains": [0, "a", 1], "grid": -1}
     (tmp_path / "appearance.json").write_text(json.dumps(record))
     assert "expected a file that clsplat train --appearance writes" in begun(tmp_path)
-    alone = Start(earlier.model, appearance_parts=(earlier.path,))
-    assert "appearance_parts but no appearance_of" in refusal(
-        lambda: Trainer(scene, earlier.config, default_device, alone)
-    )
+    start = Start(earlier.model, appearance_of=earlier.path)
+    said = refusal(lambda: train(scene, config_of("none"), device=default_device, start=start))
+    assert "the settings learn no appearance" in said

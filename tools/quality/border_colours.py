@@ -7,7 +7,9 @@ import shutil
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -17,7 +19,9 @@ from quality.trainings import Rows, Trained, trained
 
 from clsplat.arrays import Float32, Float64
 from clsplat.blocks import block_training
+from clsplat.blocks.block_settings import block_settings
 from clsplat.blocks.plan import read_plan
+from clsplat.config.training import TrainConfig
 from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import linear_to_srgb, srgb_to_linear
@@ -34,19 +38,23 @@ DARKEST = 0.01
 
 @contextmanager
 def own_appearance() -> Iterator[None]:
-    """Context in which blocks learn appearances of their own, in place of the coarse model's."""
-    with patch.object(block_training, "_with_appearance", lambda _coarse: None):
+    """Context in which blocks and finish learn appearances of their own, in place of the coarse model's."""
+
+    def start(model: Gaussians, region: TrainedRegion | None, _learnt: Path | None) -> Start:
+        return Start(model, region)
+
+    with patch.object(block_training, "Start", start):
         yield
 
 
 @contextmanager
 def frozen_appearance() -> Iterator[None]:
-    """Context in which blocks keep the coarse model's appearance, and the finish begins with it."""
+    """Context in which blocks keep the coarse model's appearance."""
 
-    def start(model: Gaussians, region: TrainedRegion | None, learnt: Path | None, **_: object) -> Start:
-        return Start(model, region, learnt, trains_appearance=region is None)
+    def frozen(*given: Any) -> TrainConfig:
+        return replace(block_settings(*given), appearance_rate=0.0)
 
-    with patch.object(block_training, "Start", start):
+    with patch.object(block_training, "block_settings", frozen):
         yield
 
 
@@ -55,7 +63,7 @@ APPEARANCES: dict[str, Callable[[], AbstractContextManager[None]]] = {
     "the coarse model's, frozen": frozen_appearance,
     "learnt by each block": own_appearance,
 }
-"""How blocks get their appearance, by what the table calls it."""
+"""Contexts in which blocks are trained, keyed by their name in the table."""
 
 
 def exposed_town(given: Namespace) -> Path:
@@ -115,7 +123,8 @@ def border_colours(given: Namespace) -> Rows:
     The town's exposures drift from flight to flight (--exposure), or each of its blocks has one (--exposed-blocks). The
     steps are those between the model and the whole's of the same seed, whose own errors then cancel, and those between
     the model and the photographs as they were before their exposures were changed. *all* is the step of the mean over
-    the trainings, *one* the largest of a single training.
+    the trainings, *one* the largest of a single training. Each training plans anew, which moves its borders by some
+    metres; they are taken in the plan's order. Wholes of two seeds, compared like this, show what chance does.
     """
     renderer, clean = Renderer(open_device()), load_scene(town_of(given), resolution=given.resolution)
     town = exposed_town(given) if given.exposed_blocks else town_of(given, given.exposure)
@@ -124,6 +133,7 @@ def border_colours(given: Namespace) -> Rows:
     settings = f"schedule=short,sky={given.sky},appearance=exposure,{growth},{given.settings}".rstrip(",")
     steps: dict[tuple[str, str], list[Float64]] = {}
     scores: dict[tuple[str, str], list[float]] = {}
+    earlier: list[Float32] | None = None
 
     def drawn(model: Gaussians) -> list[Float32]:
         return [renderer.render(model, view.camera).image for view in clean.views]
@@ -145,6 +155,10 @@ def border_colours(given: Namespace) -> Rows:
             np.stack([np.zeros((2, len(borders), 3)), colour_steps(of_whole, photographs, ground, borders)])
         )
         scores.setdefault(("", "whole"), []).append(_psnr(whole))
+        if earlier is not None:
+            found = [colour_steps(earlier, judge, ground, borders) for judge in (of_whole, photographs)]
+            steps.setdefault(("", "whole of the seed before"), []).append(np.array(found))
+        earlier = of_whole
         for kind, city in cities.items():
             for name, model in models_of(city).items():
                 images = drawn(model)

@@ -42,12 +42,11 @@ class Appearance(Component):
             return inputs
         return [replace(each, parts=(*each.parts, share)) for each, share in zip(inputs, shares, strict=True)]
 
-    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
-        """Begin with the appearance that the run in `folder` has learnt, by the names of the photographs.
+    def begin_from(self, folder: Path) -> None:
+        """Begin with the appearance that the files in `folder` have for the photographs of the same names. Its mean
+        over these photographs stays.
 
-        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs.
-        fixed: True if the appearance stays as it is.
-        Raises InputError if the run has not learnt this appearance of all training photographs.
+        Raises InputError if the files do not have this appearance of all training photographs.
         """
 
     def record(self) -> dict[str, Any] | None:

@@ -43,7 +43,6 @@ class ViewGrid(ViewPart):
     rate: learning rate of the grid in this step.
     ends: True if a pass through all training views ends with this view.
     place: the view's position in the batch.
-    fixed: True if the grid is not learnt.
     """
 
     device: Device
@@ -53,7 +52,6 @@ class ViewGrid(ViewPart):
     rate: float
     ends: bool
     place: int = 0
-    fixed: bool = False
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGrid:
         """Return this part with its grid on another device, to apply the grid there and to compute its gradient.
@@ -75,7 +73,7 @@ class ViewGrid(ViewPart):
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray | None:
-        """Return the loss's gradient with respect to the grid; None if the grid is not learnt.
+        """Return the loss's gradient with respect to the grid.
 
         image: the render before `compare`. size: its width and height.
         gradient: the loss's gradient with respect to the result of `compare`. It is replaced, in place, by the gradient
@@ -84,8 +82,6 @@ class ViewGrid(ViewPart):
         """
         of_view = (self.grids, self.view, image, gradient)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
-        if self.fixed:
-            return None
         if self.visit == 1:
             with only_tried(self.device):
                 replace(self, ends=True).update(by_grid, by_grid)
@@ -113,17 +109,14 @@ class GridsOfAll(Appearance):
         self._count = len(scene.train_views)
         start = np.broadcast_to(np.eye(3, 4, dtype=np.float32), (self._count, *GRID_SHAPE))
         self._grids = Grids.on(device, np.ascontiguousarray(start))
-        self._fixed = False
 
-    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
-        """Begin with the grids that the run in `folder` has learnt, by the names of the photographs.
+    def begin_from(self, folder: Path) -> None:
+        """Begin with the grids that the files in `folder` have for the photographs of the same names. Their mean stays.
 
-        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs.
-        fixed: True if the grids stay as they are.
-        Raises InputError if the run has no grids of this size for all training photographs.
+        Raises InputError if the files do not have grids of this size for all training photographs.
         """
         names = [view.name for view in self._scene.train_views]
-        self._grids, self._fixed = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE, parts)), fixed
+        self._grids = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE))
 
     @property
     def pixel_bytes(self) -> int:
@@ -149,7 +142,6 @@ class GridsOfAll(Appearance):
                 rate_at(self._config, number, count, ends=GRID_RATE_END_FRACTION, hastens=False),
                 number % count == 0,
                 place,
-                self._fixed,
             )
             for place, (view, number) in enumerate(zip(views, numbers, strict=True))
         ]

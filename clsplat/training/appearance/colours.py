@@ -29,6 +29,7 @@ from clsplat.stages.appearance import (
     develop,
     entry_gradient,
     rows_on,
+    scratch_on,
     step_gains,
 )
 from clsplat.training.appearance.base import Appearance
@@ -89,7 +90,6 @@ class ViewColours(ViewPart):
     taken: the photograph's row in `colours`, and its lens's row in `lenses`.
     rate, lens_rate: learning rates of the photograph's entries, and of the lens's entries.
     place: the view's position in the batch.
-    fixed: True if the entries are not learnt.
     """
 
     device: Device
@@ -101,7 +101,6 @@ class ViewColours(ViewPart):
     rate: float
     lens_rate: float
     place: int = 0
-    fixed: bool = False
     changes_target = True
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewColours:
@@ -130,15 +129,12 @@ class ViewColours(ViewPart):
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
-    ) -> DeviceArray | None:
+    ) -> DeviceArray:
         """Return the loss's gradient with respect to the entries, as column sums (`entry_gradient`), for `update`.
-        None if the entries are not learnt.
 
         image: the render, of width and height `size`. gradient: the loss's gradient with respect to it.
         At the first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
-        if self.fixed:
-            return None
         columns = entry_gradient(self.device, work, self.model, self.taken, image, gradient, size, self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -191,8 +187,8 @@ def _named(sizes: Mapping[str, int], entries: NDArray[np.float64]) -> dict[str, 
 class ColoursOfAll(Appearance):
     """Appearance model that learns a colour model's entries for each training photograph and each lens.
 
-    Photographs of one lens share the lens's entries. Gains are pulled towards their initial values, and the other
-    entries of photographs towards 0.
+    Photographs of one lens share the lens's entries. Gains are pulled towards their initial values. The mean of the
+    photographs' entries stays: 0, or that of the appearance that the training began with.
     """
 
     def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
@@ -207,19 +203,17 @@ class ColoursOfAll(Appearance):
         shape = (len(self._lens_rows), self._model.lens_entries)
         self._lenses = Gains.on(device, np.zeros(shape, np.float32)) if self._model.of_lens else None
         self._earlier: NDArray[np.float32] | None = None
-        self._fixed = False
+        self._mean = np.zeros(self._model.entries)
 
-    def begin_from(self, folder: Path, parts: Sequence[Path], *, fixed: bool) -> None:
-        """Begin with the entries that the run in `folder` has learnt, by the names of the photographs.
+    def begin_from(self, folder: Path) -> None:
+        """Begin with the entries that appearance.json in `folder` has for the photographs of the same names, and with
+        the mean of a lens's photographs. The mean of the photographs' entries stays.
 
-        parts: folders of runs of parts of the scene. Photographs that they have learnt begin with the mean of theirs,
-            and a lens with the mean of its photographs.
-        fixed: True if the entries stay as they are.
-        Raises InputError if the run has not learnt this colour model of all training photographs.
+        Raises InputError if the file does not have this colour model of all training photographs.
         """
         views, model = self._scene.train_views, self._model
-        own, of_lenses = entries_of(folder, [view.name for view in views], model, parts)
-        self._earlier, self._fixed = own.astype(np.float32), fixed
+        own, of_lenses = entries_of(folder, [view.name for view in views], model)
+        self._earlier, self._mean = own.astype(np.float32), own.mean(axis=0)
         if self._lenses is not None:
             lenses = np.array([taken.lens for taken in self._taken])
             values = np.zeros((len(self._lens_rows), model.lens_entries))
@@ -232,9 +226,6 @@ class ColoursOfAll(Appearance):
         """Entries of all training photographs. The gains among them begin at gains from points or from EXIF. The
         entries are computed on first use, because sampling the photographs takes time, and a checkpoint may replace the
         result. Entries of an earlier run replace the initial ones, but the pull is towards the initial ones."""
-        if self._fixed and self._earlier is not None:
-            self._by_points = np.zeros(len(self._earlier), np.bool_)
-            return Gains.on(self._device, self._earlier)
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
@@ -246,9 +237,8 @@ class ColoursOfAll(Appearance):
         start = np.zeros((len(scene.train_views), self._model.entries))
         start[:, :GAIN_ENTRIES] = [by_points.get(view.name, np.full(3, told)) for view, told in views]
         self._by_points = np.array([view.name in by_points for view in scene.train_views])
-        # The mean of `start` is what the training keeps. The pull does not depend on it.
-        mean = 0 if self._earlier is None else self._earlier.mean(axis=0, dtype=np.float64)
-        begun = Gains.on(self._device, (start - start.mean(axis=0) + mean).astype(np.float32), self._pull)
+        # the training keeps the mean of `start`, and the pull does not depend on it
+        begun = Gains.on(self._device, (start - start.mean(axis=0) + self._mean).astype(np.float32), self._pull)
         if self._earlier is None:
             return begun
         earlier = Gains.on(self._device, self._earlier)
@@ -284,7 +274,6 @@ class ColoursOfAll(Appearance):
                 rate_at(self._config, number, len(self._taken), ends=GAIN_RATE_END_FRACTION),
                 rate_at(self._config, number, len(self._lens_rows), ends=GAIN_RATE_END_FRACTION),
                 place,
-                self._fixed,
             )
             for place, (view, number) in enumerate(zip(views, numbers, strict=True))
         ]
@@ -322,7 +311,7 @@ class ColoursOfAll(Appearance):
         spread = np.square(told[known]).sum()
         slopes = told[known] @ logs[known] / spread if spread > 0 else np.zeros(GAIN_ENTRIES)
         held_out = _from_mean([exposure_of(view.path) for view in self._scene.test_views], self._told)
-        expected: NDArray[np.float64] = logs.mean(axis=0) + np.nan_to_num(held_out)[:, None] * slopes
+        expected: NDArray[np.float64] = self._mean[:GAIN_ENTRIES] + np.nan_to_num(held_out)[:, None] * slopes
         return expected
 
     def _of_lens(self, view: View, entries: NDArray[np.float64]) -> dict[str, list[float]]:
@@ -345,14 +334,13 @@ class ColoursOfAll(Appearance):
         shape = (len(self._scene.train_views), self._model.entries)
         values = loaded(self._device, arrays, (*GAIN_CHECKPOINT_ARRAYS, "told"), shape)
         self._by_points = values.pop("told").get()[:, 0] > 0
-        moved = allocate(self._device, shape, np.float32)
-        self._gains = Gains(**values, moved=moved, **rows_on(self._device, shape[0], self._pull))
+        self._gains = Gains(**values, **scratch_on(self._device, shape), **rows_on(self._device, shape[0], self._pull))
         self._lenses = lenses
 
     def _loaded_lenses(self, arrays: Mapping[str, NDArray[Any]]) -> Gains:
         shape = (len(self._lens_rows), self._model.lens_entries)
         held = loaded(self._device, arrays, [f"lenses_{name}" for name in LENS_CHECKPOINT_ARRAYS], shape)
         logs, first, second = held.values()
-        spare = [allocate(self._device, shape, np.float32) for _ in range(2)]
-        start = upload(self._device, np.zeros(shape, np.float32))
-        return Gains(logs, start, first, second, *spare, **rows_on(self._device, shape[0], None))
+        start, gains = upload(self._device, np.zeros(shape, np.float32)), allocate(self._device, shape, np.float32)
+        other = scratch_on(self._device, shape) | rows_on(self._device, shape[0], None)
+        return Gains(logs, start, first, second, gains, **other)

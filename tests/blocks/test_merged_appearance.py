@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mean appearance of photographs over the parts of a scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import refusal
+from compare import assert_same_bits
+
+from clsplat.blocks.merged_appearance import mean_appearance
+
+NAMES = ("a", "b", "c", "d")
+KNOWN = {"whole": NAMES, "one": ("b", "a"), "other": ("c", "b", "elsewhere")}
+"""Photographs of the whole scene and of two parts, which have them in other orders."""
+
+
+def write_colours(folder: Path, kind: str, first: float) -> Path:
+    """Write an appearance.json. Gains are `first` plus 1 for each later photograph."""
+    folder.mkdir()
+    rows: dict[str, dict[str, list[float]]] = {}
+    for place, name in enumerate(KNOWN[folder.name]):
+        rows[name] = {"log2_gains": [first + place, 0.5, -1.0]}
+        if kind == "ppisp":
+            vignette = {"vignette": [first, 0.0, 0.0], "centre": [0.5, 0.25]}
+            rows[name] |= {"mixes": [0.01 * first] * 6, **vignette}
+    (folder / "appearance.json").write_text(json.dumps({"kind": kind, "photographs": rows, "held_out": {}}))
+    return folder
+
+
+def write_grids(folder: Path, first: float) -> Path:
+    folder.mkdir()
+    places = {name: {"grid": place} for place, name in enumerate(KNOWN[folder.name])}
+    (folder / "appearance.json").write_text(json.dumps({"kind": "grid", "photographs": places, "held_out": {}}))
+    steps = np.arange(len(places), dtype=np.float32)
+    np.savez(folder / "appearance.npz", grids=np.broadcast_to(first + steps[:, None, None], (len(places), 3, 4)))
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["exposure", "ppisp"])
+def test_colours(tmp_path: Path, kind: str) -> None:
+    whole, one, other = (
+        write_colours(tmp_path / name, kind, first) for name, first in zip(KNOWN, (0, 4, -2), strict=True)
+    )
+    record, tables = mean_appearance(whole, [one, other], kind)
+    found = {name: row["log2_gains"][0] for name, row in record["photographs"].items()}
+    assert found == {"a": 5.0, "b": (4 - 1) / 2, "c": -2.0, "d": 3.0}
+    assert record["photographs"]["b"]["log2_gains"][1:] == [0.5, -1.0]
+    assert (record["kind"], record["held_out"], tables) == (kind, {}, {})
+    if kind == "ppisp":
+        row = record["photographs"]["b"]
+        assert (row["vignette"], row["centre"]) == ([1.0, 0.0, 0.0], [0.5, 0.25])
+        np.testing.assert_allclose(row["mixes"], [0.01] * 6, rtol=1e-15)  # a sum and a quotient of doubles
+
+
+def test_grids(tmp_path: Path) -> None:
+    whole, one, other = (write_grids(tmp_path / name, first) for name, first in zip(KNOWN, (0, 4, -2), strict=True))
+    record, tables = mean_appearance(whole, [one, other], "grid")
+    assert record["photographs"] == {name: {"grid": place} for place, name in enumerate(NAMES)}
+    wanted = np.array([5.0, 1.5, -2.0, 3.0], np.float32)
+    assert_same_bits(tables["grids"], np.ascontiguousarray(np.broadcast_to(wanted[:, None, None], (4, 3, 4))))
+
+
+def test_a_damaged_part_is_named(tmp_path: Path) -> None:
+    whole, one = (write_colours(tmp_path / name, "exposure", 0) for name in ("whole", "one"))
+    path = one / "appearance.json"
+
+    def said(content: object) -> str:
+        path.write_text(json.dumps(content))
+        return refusal(lambda: mean_appearance(whole, [one], "exposure"))
+
+    assert f"{path}: is of --appearance grid, expected --appearance exposure" in said({"kind": "grid"})
+    rows = {"a": {"log2_gains": [0.0, 1.0]}}
+    assert f"{path}: ValueError: expected 3 numbers a photograph" in said({"kind": "exposure", "photographs": rows})
+    path.unlink()
+    assert f"{path}: no such file" in refusal(lambda: mean_appearance(whole, [one], "exposure"))
