@@ -328,9 +328,7 @@ class GradientStep:
             project_grad(
                 rows.device,
                 rows.parameters,
-                rows.camera_array,
-                rows.projected,
-                rows.slots,
+                rows.view,
                 rows.gradients,
                 rows.screen,
                 sh_rest=self.adam_step.updates_sh_rest,
@@ -381,8 +379,8 @@ class GradientStep:
             models = (parameters, rows.gradients, first, second)
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
-            view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            project_step(rows.device, step, rows.model, *view, explore=self.explore, region=self.region)
+            target = (rows.model, rows.view, rows.screen, readback)
+            project_step(rows.device, step, *target, explore=self.explore, region=self.region)
         noise(self.device, self.explore, rows.parameters, rows.start, readback, self.region)
 
 
