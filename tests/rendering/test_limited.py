@@ -181,7 +181,7 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     statistics = new_statistics(device, 6000, contributions=True)
     frame = rasterizer.forward(model, camera, background)
     photograph = target(device, rasterizer.work, np.zeros((80, 100, 4), np.float32), background)
-    result = loss(device, rasterizer.work, frame.blended.image, photograph, 100, 80, 0.2)
+    result = loss(device, rasterizer.work, frame.blended.image, photograph, (100, 80), 0.2)
     slots, screen = rasterizer.pair_gradients(frame, result.gradient, fields=fields), rasterizer.screen(6000, fields)
     view = (ViewSlots(frame.camera_array, frame.projected, slots), screen, rasterizer.readback)
     rates = dict.fromkeys(PARAMETER_GROUPS, 1e-3)
