@@ -243,7 +243,7 @@ def _launch_whole(device: Device, given: Inputs, held: DeviceGaussians, camera_a
     view = ViewSlots(camera_array, whole, _slots(device, whole, given.slots))
     project_grad(device, held, view, gradients, screen)
     arrays = {"whole counts": whole.tile_counts, "whole splats": whole.splats, "whole screen": screen.gradients}
-    return lambda: {**read_of(**arrays)(), **{g: gradients[g].get() for g in PARAMETER_GROUPS}}
+    return lambda: {**read_of(arrays)(), **{g: gradients[g].get() for g in PARAMETER_GROUPS}}
 
 
 def _flat(model: DeviceGaussians) -> Array:

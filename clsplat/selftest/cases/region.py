@@ -49,7 +49,9 @@ def _random(rng: Generator, count: int) -> Inputs:
     means[rng.random(count) < 0.02] = np.nan
     high = np.where(low < high, high, low + 1)
     return Inputs(
-        **vars(given),
+        gaussians=given.gaussians,
+        camera=given.camera,
+        explore=given.explore,
         region=TrainedRegion(axes, low, high, middle, nearest, farthest),
         slots=rng.normal(size=(count, FIELDS.floats)).astype(np.float32),
         sparse=bool(rng.random() < 0.3),
@@ -113,7 +115,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     """Run the kernels without a region and with one."""
     results = _results(device, work, given, None)
     inside = _results(device, work, given, given.region)
-    return read_of(**results, **{f"in region {name}": array for name, array in inside.items()})
+    return read_of(results | {f"in region {name}": array for name, array in inside.items()})
 
 
 def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:

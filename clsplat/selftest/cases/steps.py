@@ -259,8 +259,7 @@ def _launch_noise(device: Device, _: Workspace, given: Inputs) -> Read:
     count = len(given.opacity_logits)
     # The means are 0, so that adding the noise rounds nothing.
     means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)
-    arrays = {name: getattr(given, name) for name in GEOMETRY_ARRAYS}
-    held = upload_gaussians(device, Gaussians(means=means, sh=sh, **arrays))
+    held = upload_gaussians(device, Gaussians(means, given.quaternions, given.log_scales, given.opacity_logits, sh))
     noise(device, given.explore, held, 0, fresh_readback(device))
     return lambda: {name: held[name].get() for name in ("means", *GEOMETRY_ARRAYS)}
 
