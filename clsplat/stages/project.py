@@ -61,8 +61,8 @@ class Projected:
 
     @property
     def chunk_defines(self) -> dict[str, object]:
-        """Defines for kernels that run over the projected Gaussians and index the model's arrays: CHUNKS if only some
-        chunks were projected, so that the kernel finds rows by the list of chunks."""
+        """Defines for kernels that run over the projected Gaussians and index the model's arrays. CHUNKS is set if only
+        some chunks were projected: the kernel then finds rows by the list of chunks."""
         return {} if self.chunks is None else {"CHUNKS": True}
 
     @property
@@ -241,7 +241,7 @@ def project_grad(
     sh_rest: also compute the gradient of the higher SH bands.
     explore: penalties on opacity and scale, whose gradients are added.
     by_lens: (n, 4), filled with each Gaussian's gradient with respect to the logs of the focal lengths and to the
-    principal point in pixels, for a camera with an image plane.
+    principal point in pixels. The camera must have an image plane.
     region: the region in which Gaussians get gradients, in the coordinates of the means; None for everywhere. Visible
     Gaussians outside it get zeros.
 

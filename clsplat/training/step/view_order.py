@@ -18,7 +18,7 @@ CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
 """Number of clusters whose views alternate. With one cluster after the other, successive views would have more in
-common, but the scene bonsai loses 0.3 dB: the model fits the last cluster at the expense of the other clusters
+common. But the scene bonsai then loses 0.3 dB: the model fits the last cluster at the expense of the others
 (docs/decisions/0050)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.

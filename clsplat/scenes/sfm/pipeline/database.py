@@ -250,8 +250,8 @@ def weight_gps(database: Path) -> None:
 def feature_evidence(database: Path) -> dict[str, Any]:
     """Return counts of features and matches, for the message about a failed reconstruction.
 
-    Keys: "features" is the median number in a photograph, "pairs" the number of pairs that were tried, "matched" the
-    number of pairs with verified matches, and "matches" the largest number of verified matches of a pair.
+    Keys: "features" is the median number in a photograph, and "pairs" the number of pairs that were tried. "matched" is
+    the number of pairs with verified matches, and "matches" the largest number of these in a pair.
     """
     with contextlib.closing(sqlite3.connect(database)) as connection:
         features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
