@@ -38,7 +38,7 @@ ALL_EXACT_SWITCHES_OFF = "all exact switches off"
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Fields of `RasterizerConfig` of which any value is approximate except that of the preset `exact`. The field `extent`,
+"""Fields of `RasterizerConfig` in which all values but the preset `exact`'s are approximate. The field `extent`,
 which is not listed, is approximate only if it is "3sigma"."""
 
 

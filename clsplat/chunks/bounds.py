@@ -102,7 +102,7 @@ class ChunkBounds:
 
 
 def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:
-    """Return the largest change (B,) of values by `updates` updates, each of which is rounded to float32.
+    """Return the largest change (B,) of values by `updates` updates, each rounded to float32.
 
     After a change by d the values are at most size + d, so that each rounding is at most (size + d) 2^-24.
 

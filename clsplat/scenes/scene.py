@@ -208,7 +208,7 @@ class Scene:
     world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
     file_unit: length of a unit of the scene's files, in world units.
     georeference: where the scene lies on the earth; None if it is unknown.
-    whole_extent: extent of the scene of which this is a part; None if it is no part.
+    whole_extent: extent of the scene that this is a part of; None if it is no part.
     """
 
     name: str

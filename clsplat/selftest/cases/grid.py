@@ -43,7 +43,7 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """Inputs from the self-test's scene: the blended image, and grids of two photographs, of which one is used."""
+    """Inputs from the self-test's scene: the blended image, and grids of two photographs; one is used."""
     grids = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
     by_seen = evenly(44, tuple(bench.blended.image.shape), -0.25, 1.0).astype(np.float32)
     image, by_seen = (cropped(each, bench.camera) for each in (bench.blended.image.get(), by_seen))

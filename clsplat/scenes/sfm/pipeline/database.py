@@ -172,7 +172,7 @@ def verified_matches(database: Path) -> dict[tuple[int, int], NDArray[np.uint32]
 
 
 def cameras_without_focal_length(database: Path) -> list[pycolmap.Camera]:
-    """Return the pinhole cameras, with or without distortion, of which EXIF gives no focal length."""
+    """Return the pinhole cameras, with or without distortion, for which EXIF gives no focal length."""
     with pycolmap.Database.open(database) as opened:
         cameras = opened.read_all_cameras()
     return [camera for camera in cameras if camera.is_perspective_pinhole() and not camera.has_prior_focal_length]
