@@ -25,8 +25,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import PLAIN_SLOTS
 from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
-from clsplat.reference.project import project
-from clsplat.reference.render import parameters
+from clsplat.reference.render import project_model
 from clsplat.rendering.memory_needs import StepMemory, plan_step
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.renderer import held_sh
@@ -39,7 +38,7 @@ ALL_EXACT_SWITCHES_OFF = "all exact switches off"
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Fields of `RasterizerConfig` of which any value is approximate except that of the preset `exact`. The field `extent`,
+"""Fields of `RasterizerConfig` in which all values but the preset `exact`'s are approximate. The field `extent`,
 which is not listed, is approximate only if it is "3sigma"."""
 
 
@@ -250,8 +249,7 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
     crop: x, y, width and height in pixels. Gaussians that do not reach the crop are skipped.
     """
     x, y, width, height = crop
-    degree, antialiased = gaussians.sh_degree, gaussians.antialiased
-    projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=antialiased)
+    projected = project_model(gaussians, camera, gaussians.sh_degree)
     means = projected.means2d - (x, y)
     reach = 1.1 * projected.half_extents + 1.0
     near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)

@@ -27,7 +27,7 @@ class Subject:
 
     camera: camera from which frames are rendered.
     photograph: (H, W, 3) uint8, the target of a training step; None makes a target from the frame.
-    masks: what masks and alpha channels mean. Unless it is NO_MASKS, the photograph is (H, W, 5), as from
+    masks: meaning of masks and alpha channels. Unless it is NO_MASKS, the photograph is (H, W, 5), as from
         `View.load_masked`.
     """
 

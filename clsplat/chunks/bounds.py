@@ -102,7 +102,7 @@ class ChunkBounds:
 
 
 def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:
-    """Return the largest change (B,) of values by `updates` updates, each of which is rounded to float32.
+    """Return the largest change (B,) of values by `updates` updates, each rounded to float32.
 
     After a change by d the values are at most size + d, so that each rounding is at most (size + d) 2^-24.
 
@@ -119,8 +119,8 @@ def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float6
 def largest_step(config: OptimiserConfig) -> float:
     """Return the largest change of a parameter by a step of Adam, as a multiple of the learning rate: 7.3 by default.
 
-    Let b1, b2 be the decays, r = b1^2 / b2 < 1, and S(x) = 1 + x + ... + x^(t - 1). After t steps with gradients g_i,
-    Cauchy and Schwarz give for the moments m and v:
+    Let b1, b2 be the decays, r = b1^2 / b2 < 1, and S(x) = 1 + x + ... + x^(t - 1). Take t steps with gradients g_i. By
+    Cauchy and Schwarz, their moments m and v have the bound
 
         |m| <= (1 - b1) sum b1^(t - i) |g_i|
              = (1 - b1) sum r^((t - i) / 2) b2^((t - i) / 2) |g_i|
@@ -150,8 +150,8 @@ def largest_step(config: OptimiserConfig) -> float:
 def largest_resumed_step(config: OptimiserConfig, ratio: float, step: int) -> float:
     """Return `largest_step` after a resume from a checkpoint whose moments may be from a training with other decays.
 
-    Let c be the limit in `largest_step`, so that (1 - b1)^2 / (1 - b2) = (1 - r) c^2. If |m| <= d sqrt(v) with d >= c,
-    Cauchy and Schwarz give for the next moments
+    Let c be the limit in `largest_step`, so that (1 - b1)^2 / (1 - b2) = (1 - r) c^2. Let |m| <= d sqrt(v) with d >= c.
+    By Cauchy and Schwarz, the next moments have the bound
 
         |b1 m + (1 - b1) g| <= sqrt(r d^2 + (1 - r) c^2) sqrt(b2 v + (1 - b2) g^2) <= d sqrt(v of the next step).
 

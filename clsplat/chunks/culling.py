@@ -113,9 +113,9 @@ class PictureBorders:
         """The planes beyond which chunks are hidden, for cameras with an image plane.
 
         By equations (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z +
-        b), with k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse
-        reaches the left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l. Times z > 0
-        this is
+        b). Here k is the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An
+        ellipse reaches the left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l.
+        Times z > 0 this is
 
             f x + (k b - l) z + k f sqrt(1 + r^2) s >= 0,
 
@@ -230,8 +230,8 @@ def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64
     """Return two half angles (B,), in radians: of the largest cone around a Gaussian, and of the whole chunk's cone.
 
     A Gaussian's cone is around the direction of its mean. By equations (12) and (13) of docs/cameras.md, the Gaussian's
-    ellipse lies in the plane that touches the unit sphere at this direction; a ray at an angle to the direction reaches
-    the plane at the angle's tangent. The ellipse's half axis is at most k (s / d + b w), with k the reach, s the
+    ellipse lies in the plane that touches the unit sphere at this direction. A ray at an angle to the direction reaches
+    the plane at the angle's tangent. The ellipse's half axis is at most k (s / d + b w). Here k is the reach, s the
     largest scale, d the distance, b^2 the low-pass and w the pixel's width. The chunk's half angle is NaN from 90
     degrees on.
 

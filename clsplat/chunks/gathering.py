@@ -132,8 +132,8 @@ def gathered(
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
     """Yield numbers and records of the new chunks, up to BLOCK_CHUNKS at a time.
 
-    rows: for each row of the new model, the old row that it is a copy of, with the bit FRESH set if it is new; None for
-        the same rows as before.
+    rows: for each row of the new model, the old row that it copies, with the bit FRESH set if it is new. None if each
+        row is its own source.
     to: division of the new rows into chunks. Records are made only for chunks that are NEW in `to.kept`.
     record: type of the new records. It may lack fields of the old records. SH coefficients that it adds are zero.
     passed: function that is called after each yield with the number of the first old chunk that may still be read. The

@@ -23,7 +23,7 @@ from clsplat.files.atomic import remove, require_room, sync_folder, write_error
 
 
 class ScratchError(InputError):
-    """Raised if a scratch file cannot be read, or differs from what was written. No wrong row has been used."""
+    """Raised if a scratch file cannot be read, or differs from the data written. No wrong row has been used."""
 
 
 class SlotFile:

@@ -41,8 +41,8 @@ class SelftestVerb(Verb):
     json: Flag = False
     """Print the result as JSON."""
     report: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """Write a file for a bug report. It holds the result, the system, its packages, the limits of each device, digests,
-    the kernel shapes and kernels that failed with a driver, and the times of a frame's and a training step's stages."""
+    """Write a file for a bug report, with the result, the system, its packages, the limits of each device, and digests.
+    It also has kernel shapes and kernels that failed with a driver, and times of the stages of a frame and a step."""
     overwrite: Flag = False
     """Replace an existing file."""
 

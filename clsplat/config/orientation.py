@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of a scene's coordinate frame: its orientation (`--orient`), and what gives its scale (`--scale`)."""
+"""Settings of a scene's coordinate frame: its orientation (`--orient`), and the source of its scale (`--scale`)."""
 
 from __future__ import annotations
 

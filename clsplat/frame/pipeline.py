@@ -177,7 +177,7 @@ class FramePipeline:
         """Prepare a deep frame, as `draw` prepares a flat one.
 
         bins: maximum number of slices per pixel.
-        Returns three functions: the first renders the frame, the second converts its colours to the file's colour
+        Returns three functions. The first renders the frame, the second converts its colours to the file's colour
         space, and the third gives the number of rows of a strip for a camera.
         """
         sampling, colours, device = self._sampling(frame), self.colours, self._renderer.device

@@ -43,7 +43,7 @@ def exposure_of(path: Path) -> float | None:
 
 
 def lens_of(spec: Any) -> tuple[str, ...]:
-    """Return a photograph's camera and lens as texts, "" for what is missing, from OpenImageIO's specification.
+    """Return a photograph's camera and lens as texts, "" for missing ones, from OpenImageIO's specification.
 
     They are the camera's make and model, the lens's model, the focal length in millimetres and its 35 mm equivalent,
     which tells digital zoom.

@@ -161,10 +161,10 @@ class Projection:
         Returns
         -------
         dict
-            float32 gradients by argument name: "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in
-            the given shape; "viewmats" (C, 4, 4), where all entries of the first three rows count as independent
-            variables; "intrinsics" (C, 3, 3) for fx, fy, cx and cy. Gradients of culled Gaussians are zero. In covars
-            (N, 6), an off-diagonal entry has its whole gradient; in (N, 3, 3), each of its two places has half.
+            float32 gradients by argument name. "means" is (N, 3). "quaternions" (N, 4) and "scales" (N, 3), or "covars"
+            in the given shape. In "viewmats" (C, 4, 4), all entries of the first three rows count as independent
+            variables. "intrinsics" (C, 3, 3) is for fx, fy, cx and cy. Gradients of culled Gaussians are zero. In
+            covars (N, 6), an off-diagonal entry has its whole gradient; in (N, 3, 3), each of its two places has half.
 
         Raises
         ------

@@ -122,8 +122,8 @@ class Rasterization:
         -------
         dict
             float32 gradients: "means2d" (C, N, 2); "conics" (C, N, 3), whose entry b counts as one variable;
-            "opacities" (C, N), after compensation; "colors2d" (C, N, D); "depths" (C, N) if the images have depth;
-            "backgrounds" (C, D) if they were given; with `absolute_gradients` also "absolute" (C, N, 2), sums over
+            "opacities" (C, N), after compensation; "colors2d" (C, N, D). "depths" (C, N) if the images have depth, and
+            "backgrounds" (C, D) if they were given. With `absolute_gradients` also "absolute" (C, N, 2), sums over
             pixels of absolute gradients with respect to means2d.
 
         Raises
@@ -164,9 +164,9 @@ class Rasterization:
         -------
         dict
             "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in the given shape; "opacities" (N,);
-            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4), where all
-            entries of the first three rows count as independent variables, and "intrinsics" (C, 3, 3) for fx, fy, cx
-            and cy.
+            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4) and "intrinsics"
+            (C, 3, 3). In the first, all entries of the first three rows count as independent variables; the second is
+            for fx, fy, cx and cy.
 
         Raises
         ------

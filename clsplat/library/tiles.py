@@ -71,22 +71,10 @@ def isect_tiles(
     depth = np.ascontiguousarray(floats("depths", depths, count).reshape(-1))
     tile_size, tile_width, tile_height = _lengths(tile_size=tile_size, tile_width=tile_width, tile_height=tile_height)
     images, image = _images(count, image_ids, None if n_images is None else whole(n_images))
-
     counts, owner, tile = _tiles_of_boxes(means.reshape(-1, 2), reach, tile_size, (tile_width, tile_height))
-    tile_bits = (tile_width * tile_height).bit_length()
-    if images.bit_length() + tile_bits + ISECT_ID_DEPTH_BITS > 64:
-        raise InputError(
-            f"{images} images of {tile_width} x {tile_height} tiles do not fit in 64-bit ids, expected fewer"
-        )
-    ids = (
-        (image[owner] << (tile_bits + ISECT_ID_DEPTH_BITS))
-        | (tile << ISECT_ID_DEPTH_BITS)
-        | depth.view(np.uint32).astype(np.int64)[owner]
-    )
-    if sort:
-        order = np.argsort(ids, kind="stable")
-        ids, owner = ids[order], owner[order]
-    return counts.reshape(count).astype(np.int32), ids, owner.astype(np.int32)
+    ids = _packed(image[owner], tile, depth[owner], images, (tile_width, tile_height))
+    order = np.argsort(ids, kind="stable") if sort else slice(None)
+    return counts.reshape(count).astype(np.int32), ids[order], owner[order].astype(np.int32)
 
 
 def _tiles_of_boxes(
@@ -106,6 +94,17 @@ def _tiles_of_boxes(
     within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     across = np.maximum(sides[owner, 0], 1)
     return counts, owner, (low[owner, 1] + within // across) * tiles[0] + low[owner, 0] + within % across
+
+
+def _packed(image: Int64, tile: Int64, depth: Float32, images: int, tiles: tuple[int, int]) -> Int64:
+    """Return the ids of pairs from their images, tiles and depths, (pairs,) each. Raises InputError if they do not fit.
+
+    images: number of images. tiles: number of tiles across and down.
+    """
+    tile_bits = prod(tiles).bit_length()
+    if images.bit_length() + tile_bits + ISECT_ID_DEPTH_BITS > 64:
+        raise InputError(f"{images} images of {tiles[0]} x {tiles[1]} tiles do not fit in 64-bit ids, expected fewer")
+    return (((image << tile_bits) | tile) << ISECT_ID_DEPTH_BITS) | depth.view(np.uint32).astype(np.int64)
 
 
 def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, tile_height: int) -> NDArray[np.int32]:

@@ -144,7 +144,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
     budget: memory limit, bytes.
     max_allocation: largest size of an array, bytes.
-    alignment: number of which `Plan.rows` must be a multiple if parameters are streamed.
+    alignment: `Plan.rows` must be a multiple of this if parameters are streamed.
     Raises CapacityError if not even the smallest pieces fit.
     """
     photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)

@@ -44,7 +44,16 @@ from clsplat.stages.duplicate import (
     plan_bands,
 )
 from clsplat.stages.holdout import Held, holdout
-from clsplat.stages.project import Projected, Screen, Slots, add_slots, project, project_grad, thinning_numbers
+from clsplat.stages.project import (
+    Projected,
+    Screen,
+    Slots,
+    ViewSlots,
+    add_slots,
+    project,
+    project_grad,
+    thinning_numbers,
+)
 from clsplat.stages.ranges import TileLists, tile_lists
 
 R = TypeVar("R")
@@ -388,8 +397,8 @@ class Rasterizer:
         """
         slots = self.pair_gradients(frame, image_gradient, fields=fields)
         screen = self.screen(gaussians.count, fields)
-        arrays = (gaussians, frame.camera_array, frame.projected, slots, gradients, screen)
-        project_grad(self.device_of(frame.camera), *arrays, by_lens=by_lens)
+        view = ViewSlots(frame.camera_array, frame.projected, slots)
+        project_grad(self.device_of(frame.camera), gaussians, view, gradients, screen, by_lens=by_lens)
         return screen
 
     def screen(self, count: int, fields: SlotFields) -> Screen:

@@ -309,8 +309,8 @@ class Renderer:
         *,
         moved: int = 0,
     ) -> tuple[AnyGaussians, Camera]:
-        """The model on the device, or on the host if the device has no room for it and a frame of this size; and the
-        camera relative to the model's origin.
+        """The model on the device, and the camera relative to the model's origin. The model is on the host if the
+        device has no room for it and a frame of this size.
 
         features: floats of each Gaussian that are blended to extra channels.
         planes: bytes per pixel in addition to the picture's.

@@ -66,7 +66,7 @@ class Comparison:
 
 
 def compare_runs(runs: Sequence[Run]) -> Comparison:
-    """Read the numbers of runs, with notes on what makes them hard to compare.
+    """Read the numbers of runs, with notes on differences that make them hard to compare.
 
     Raises InputError like `read_run_numbers`, and for more than MAX_COMPARED_RUNS runs.
     """

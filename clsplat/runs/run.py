@@ -139,7 +139,7 @@ class Run:
         return read_frame(self.path) if (self.path / FRAME_RECORD_FILE).exists() else None
 
     def is_scene(self, path: Path) -> bool:
-        """True if `path` is the run's scene, or what structure from motion made of it."""
+        """True if `path` is the run's scene, or its reconstruction by structure from motion."""
         if self.scene is None:
             return False
         own, other = self.scene.resolve(), path.resolve()

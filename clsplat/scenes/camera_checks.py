@@ -46,7 +46,7 @@ at least a quarter of the points.
 """
 MAX_CONVERGING_FRACTION_AS_GIVEN, MIN_CONVERGING_FRACTION_INVERTED = 0.2, 0.9
 """Inverted poses are reported if at most the first fraction of the cameras faces a common point with the poses as
-given, but at least the second fraction faces a common point with the poses inverted."""
+given. With the poses inverted, at least the second fraction must face a common point."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 

@@ -259,7 +259,7 @@ class SceneFrame:
         the world's x axis points east, and z north.
     measured: the coordinates of two points that gave the scale, and the scale of world_from_source when they were
         measured; () if no points gave it.
-    up_note, scale_note: what the up direction and the unit come from, for the user; "" if neither was set.
+    up_note, scale_note: sources of the up direction and the unit, for the user; "" if neither was set.
     """
 
     world_from_source: Float64 = field(default_factory=lambda: np.eye(4))

@@ -41,8 +41,8 @@ FAR_ORIGIN_RATIO = 64.0
 At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel if the scene is 2600 pixels wide.
 """
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
-"""A distant camera is not an outlier if its picture shows at least this many points, and the standard deviation of
-their pixels is at least this fraction of the width or height.
+"""A distant camera is not an outlier if its picture shows at least this many points, spread at least this far. The
+spread is the standard deviation of the points' pixels, as a fraction of the width or height.
 
 Such a picture shows the scene from further away, or another reconstructed part of it. Points all over the picture have
 a standard deviation of 0.29. The picture of an outlier shows no points, or has every point in one pixel.
@@ -208,7 +208,7 @@ class Scene:
     world_from_files: (4, 4), the similarity from the frame of the scene's files to the scene's; None if they are equal.
     file_unit: length of a unit of the scene's files, in world units.
     georeference: where the scene lies on the earth; None if it is unknown.
-    whole_extent: extent of the scene of which this is a part; None if it is no part.
+    whole_extent: extent of the scene that this is a part of; None if it is no part.
     """
 
     name: str

@@ -152,7 +152,7 @@ class Case:
         return outcome.compared(parts, **wrong)
 
 
-def read_of(**arrays: DeviceArray) -> Read:
+def read_of(arrays: Mapping[str, DeviceArray]) -> Read:
     """Return a function that reads these arrays from the device, by name."""
     return lambda: {name: array.get() for name, array in arrays.items()}
 

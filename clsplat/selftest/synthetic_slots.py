@@ -15,7 +15,7 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.render import project_model
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.project import Slots
+from clsplat.stages.project import Slots, ViewSlots
 
 SLOT_MOMENTS = slice(SLOT.index("G"), SLOT.index("GVV") + 1)
 """Columns of a slot: the sum of g (docs/gradients.md), then the first and second moments of g."""
@@ -34,16 +34,17 @@ def slot_sums(bench: CaseBench, slots: Array) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class MadeUpSlots:
-    """Synthetic slots, one for each pair, and their float64 sums (n, SLOT_PLAIN) for each Gaussian."""
+    """Synthetic slots, one for each pair of the scene, and their float64 sums (n, SLOT_PLAIN) for each Gaussian."""
 
-    slots: Slots
+    view: ViewSlots
     sums: Float64
 
     @classmethod
     def of(cls, bench: CaseBench) -> MadeUpSlots:
         """Make synthetic slots for the pairs of the bench's scene."""
         values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
-        return cls(Slots(upload(bench.device, values), bench.counted.first_slots), slot_sums(bench, values))
+        slots = Slots(upload(bench.device, values), bench.counted.first_slots)
+        return cls(ViewSlots(bench.camera_array, bench.projected, slots), slot_sums(bench, values))
 
     def d_means(self, bench: CaseBench) -> Float64:
         """Return gradients (n, 2) per pixel with respect to the means on the image, by (50) of docs/gradients.md."""

@@ -38,7 +38,7 @@ MAX_SCENE_REGION_RADIUS_RATIO = 0.2
 radius. Measured fractions are 0.3 or more for a single object, and 0.05 for a room with a table in the middle."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
 """Lower limit of Gaussians' sizes in the measure of detail: this quantile of all sizes, but at least this fraction of
-the model's radius, since some files have Gaussians of size 0."""
+the model's radius. Some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius that an orbit shows, relative to the radius of the scene's most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1

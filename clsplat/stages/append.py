@@ -31,8 +31,8 @@ too much work, and the radix sort is faster.
 """
 
 LOCAL_PAIRS = 2048
-"""Maximum pairs of a list that a group sorts in local memory. They take 16 KiB, half of what every device has. Must be
-a power of two, 16 or more."""
+"""Maximum pairs of a list that a group sorts in local memory. They take 16 KiB, half of the local memory that every
+device has. Must be a power of two, 16 or more."""
 
 _OFFSET_ITEMS = 1024
 """Number of work-items in each of the two groups of `list_offsets`. The first group handles the lengths of all tiles'

@@ -24,8 +24,8 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
 
 _TABLE_NUMBERS = 2 + len(PARAMETER_GROUPS)
-"""Number of columns of a step table: 1 / sqrt(1 - beta2^t), for all parameter groups but sh_rest and for sh_rest, then
-the learning rate / (1 - beta1^t) of each group (`step_numbers`)."""
+"""Number of columns of a step table. The first two are 1 / sqrt(1 - beta2^t), for all parameter groups but sh_rest and
+for sh_rest. The others are the learning rate / (1 - beta1^t) of each group (`step_numbers`)."""
 _ABREAST = 4
 """Number of elements that a work-item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
 

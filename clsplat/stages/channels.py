@@ -163,7 +163,7 @@ def channels(
     """Blend a row of values of each Gaussian into channels, with the same weights as the image in `blended`.
 
     lists: the tile lists from which the image was blended.
-    wanted: the features, or other values, of which a row consists.
+    wanted: the features, or other values, in a row.
     rows: (n, wanted.floats), the values of each Gaussian, such as the result of `features`.
     held: surfaces of the holdout; None without a holdout.
     """

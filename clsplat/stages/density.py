@@ -264,8 +264,8 @@ class DeviceMarker:
     def _pieces(self) -> Iterator[tuple[int, int]]:
         """Yield the ranges [start, stop) of rows that are marked together.
 
-        A streamed model is marked in parts. A part has as many rows as are on the device at once or, with a pool, half
-        as many rows as the pool, so that marks and statistics fit in the memory of the splats.
+        A streamed model is marked in parts. A part has as many rows as are on the device at once. With a pool it has
+        half as many rows as the pool, so that marks and statistics fit in the memory of the splats.
         """
         model = self.parameters
         rows = model.rows if isinstance(model, HostGaussians) else max(model.count, 1)

@@ -220,9 +220,8 @@ def chunk_parts(
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList]]:
     """Bring chunks to the device part by part, as many at a time as the pool has slots.
 
-    Yields (start, stop, models, slots): the part's rows [start, stop) in a launch over all of `chunks`; the pool's
-    arrays of each model; and the list of the slots that hold the part's chunks. Each part is valid until the next part
-    is requested.
+    Yields (start, stop, models, slots): the part's rows [start, stop) in a launch over all of `chunks`, the pool's
+    arrays of each model, and the slots of the part's chunks. Each part is valid until the next part is requested.
 
     models: models in one pool.
     changes: True if the device will change the models. The parts then come in reverse order: the previous pass, which

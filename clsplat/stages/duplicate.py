@@ -61,7 +61,7 @@ class Totals:
     visible, pairs: the numbers of visible Gaussians and of pairs; pairs are capped at 2^32 - 1.
     refused: numbers of elements that `adam` did not update, by reason (`columns.REFUSED`).
 
-    In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds, and these fields are set:
+    In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds. These fields are then set.
 
     on_device: the READBACK array from which the pass's kernels read the two numbers.
     arriving: function that waits for the host's copy of the READBACK array, and returns it.

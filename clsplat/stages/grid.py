@@ -48,8 +48,8 @@ def _spans(width: int, height: int) -> tuple[float, float]:
 def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
     """Bytes per pixel, padding included: the planes of the transformed image, and a share of the other arrays.
 
-    These are the grids, their moments and their mean, the gradient with respect to a grid, and the sums of the gradient
-    along each image row, for the largest of the `sizes` (width, height).
+    These are the grids, their moments and mean, the gradient with respect to a grid, and the gradient's sums along
+    image rows, for the largest of the `sizes` (width, height).
     """
     lines = max((height for _, height in sizes), default=0) * GRID_SHAPE[2] * 12 * GRID_SHAPE[0]
     held = 4 * (3 * GRID_FLOATS * photographs + 2 * GRID_FLOATS + lines)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +15,8 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.profile import stage
 from clsplat.layouts.columns import LOSS_COLUMNS, LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS, LOSS_RING, TILE
-from clsplat.stages.blend import Blended, tile_items
-from clsplat.stages.loss_terms import Compared, LossTerm
+from clsplat.stages.blend import tile_items
+from clsplat.stages.loss_terms import Compared, RenderTerms
 from clsplat.stages.target import is_photograph, sample_defines
 
 LOSS_PIXEL_BYTES = 12
@@ -121,27 +121,26 @@ def loss(
     work: Workspace,
     image: DeviceArray,
     target: DeviceArray,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     weight: float,
     sums_index: int = 0,
     *,
     kept: int | None = None,
-    blended: Blended | None = None,
-    terms: Sequence[LossTerm] = (),
+    further: RenderTerms | None = None,
 ) -> Loss:
     """Compute (1 - weight) L1 + weight (1 - SSIM) of an image and its target.
 
     image: planes (3, rows, stride), whose padding must be zero.
     target: planes like the image's; or a photograph (height, width, 3), uint8 or float32, if several items share a
     tile (`tile_items`).
+    size: width and height in pixels, without padding.
     sums_index: index of the array for the loss's sums. A call's sums can be read until the next call with this index.
     kept: number of pixels that no mask excludes, over which the means are taken; None for all pixels. Excluded pixels
         are zero in both images.
-    blended: the render; needed only if there are terms.
-    terms: loss terms to add. Each has a plane of the gradient, after the colours, and its own partial sums.
+    further: loss terms to add. Each has a plane of the gradient, after the colours, and its own partial sums.
     """
-    _, rows, stride = image.shape
+    (width, height), (_, rows, stride) = size, image.shape
+    terms = () if further is None else further.terms
     every, blocks, items = 3 * width * height, _blocks(device, height, stride), tile_items(device)
     samples = every if kept is None else max(3 * kept, 1)
     partials = work.array("loss_partials", (blocks.partials,))
@@ -161,11 +160,10 @@ def loss(
         kernels, items = device.kernels("loss", defines), min(items, LOSS_PARTS)
         launch_groups(device, kernels.loss_ssim, blocks.groups, items, *sizes, *pictures, partials, sums)
         launch_groups(device, kernels.loss_grad, blocks.groups, items, *sizes, *weights, *pictures, *results)
-    further = []
-    for number, term in enumerate(terms):
-        assert blended is not None, "loss terms need the render: argument blended"
-        compared = Compared(device, work, blended, target, gradient, sums, samples / 3)
-        term.launch(compared, 3 + number, own + each * number)
-        further.append((*term.scale(samples / 3), each))
+    if further is not None:
+        compared = Compared(device, work, further.blended, target, gradient, sums, samples / 3)
+        for number, term in enumerate(terms):
+            term.launch(compared, 3 + number, own + each * number)
+    scales = tuple((*term.scale(samples / 3), each) for term in terms)
     masked = 0 if kept is None else every - 3 * kept
-    return Loss(gradient, sums, samples, weight, masked=masked, further=tuple(further))
+    return Loss(gradient, sums, samples, weight, masked=masked, further=scales)

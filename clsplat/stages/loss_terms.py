@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,14 @@ class LossTerm:
         """Launch the term's kernel, which writes the plane with index `plane` of `compared.gradient`, and the term's
         partial sums to `compared.sums` from index `first` on."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class RenderTerms:
+    """Loss terms to add to L1 and D-SSIM, and the render that they read."""
+
+    blended: Blended
+    terms: Sequence[LossTerm]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf
-from typing import NamedTuple
 
 import numpy as np
 
@@ -62,8 +61,8 @@ class Projected:
 
     @property
     def chunk_defines(self) -> dict[str, object]:
-        """Defines for kernels that run over the projected Gaussians and index the model's arrays: CHUNKS if only some
-        chunks were projected, so that the kernel finds rows by the list of chunks."""
+        """Defines for kernels that run over the projected Gaussians and index the model's arrays. CHUNKS is set if only
+        some chunks were projected: the kernel then finds rows by the list of chunks."""
         return {} if self.chunks is None else {"CHUNKS": True}
 
     @property
@@ -181,6 +180,15 @@ class Slots:
 
 
 @dataclass(frozen=True, eq=False)
+class ViewSlots:
+    """A view's camera on the device, the Gaussians that it projects, and the slots of their pairs."""
+
+    camera_array: DeviceArray
+    projected: Projected
+    slots: Slots
+
+
+@dataclass(frozen=True, eq=False)
 class Screen:
     """Screen-space results of one view. Only the rows of visible Gaussians are written.
 
@@ -218,9 +226,7 @@ def add_slots(
 def project_grad(
     device: Device,
     gaussians: DeviceGaussians,
-    camera_array: DeviceArray,
-    projected: Projected,
-    slots: Slots,
+    view: ViewSlots,
     gradients: DeviceGaussians,
     screen: Screen,
     *,
@@ -231,35 +237,32 @@ def project_grad(
 ) -> None:
     """Compute `gradients` and `screen` of the visible Gaussians from the slots of their pairs.
 
-    slots: the gradients of the pairs, or their sums.
     gradients: filled with the gradients in the parameters' shapes; rows of invisible Gaussians are not written.
     sh_rest: also compute the gradient of the higher SH bands.
     explore: penalties on opacity and scale, whose gradients are added.
     by_lens: (n, 4), filled with each Gaussian's gradient with respect to the logs of the focal lengths and to the
-    principal point in pixels, for a camera with an image plane.
+    principal point in pixels. The camera must have an image plane.
     region: the region in which Gaussians get gradients, in the coordinates of the means; None for everywhere. Visible
     Gaussians outside it get zeros.
 
-    If only some chunks of `gaussians` were projected, the gradients have the rows of `projected`.
+    If only some chunks of `gaussians` were projected, the gradients have the rows of `view.projected`.
     """
     in_region, bounds = region_build(region)
-    weights, build = explore.weights, _build(device)
-    defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines, **projected.chunk_defines}
-    defines |= {"PENALTIES": True} if weights else {}
-    defines |= in_region | ({} if by_lens is None else {"LENS": True})
-    n = projected.tile_counts.shape[0]
+    defines = _defines(device, gaussians, view, explore, sh_rest=sh_rest) | in_region
+    defines |= {} if by_lens is None else {"LENS": True}
+    n = view.projected.tile_counts.shape[0]
     launch_items(
         device,
         device.kernels("project_grad", defines).project_grad,
-        -(-n // build.lanes) if slots.values.shape[0] else 0,
+        -(-n // _lanes(device)) if view.slots.values.shape[0] else 0,
         n,
-        *_inputs(gaussians, camera_array, projected, slots),
+        *_inputs(gaussians, view),
         *(model[group] for model in (gaussians, gradients) for group in PARAMETER_GROUPS),
         screen.gradients,
-        *([screen.contributions] if slots.fields.contributions else []),
+        *([screen.contributions] if view.slots.fields.contributions else []),
         *([] if by_lens is None else [by_lens]),
-        *weights,
-        *projected.chunk_arguments,
+        *explore.weights,
+        *view.projected.chunk_arguments,
         *bounds,
     )
 
@@ -284,9 +287,7 @@ def project_step(
     device: Device,
     step: AdamStep,
     model: tuple[DeviceGaussians, ...],
-    camera_array: DeviceArray,
-    projected: Projected,
-    slots: Slots,
+    view: ViewSlots,
     screen: Screen,
     readback: DeviceArray,
     *,
@@ -299,22 +300,20 @@ def project_step(
     The other arguments are as in `project_grad` and `adam`.
     """
     parameters, config = model[0], step.config
-    n = projected.tile_counts.shape[0]
-    defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True, **projected.chunk_defines}
+    n = view.projected.tile_counts.shape[0]
+    in_region, bounds = region_build(region)
+    defines = _defines(device, parameters, view, explore, sh_rest=step.updates_sh_rest) | {"ADAM": True} | in_region
     if config.sparse:
         defines["SPARSE"] = True
     if config.late:
         defines["VISIBLE"] = True
     numbers = [LaunchParameter(number) for number in step_numbers(step, explore)]
     weights = len(explore.weights)
-    if weights:
-        defines["PENALTIES"] = True
-    in_region, bounds = region_build(region)
     arguments = (
         n,
-        *_inputs(parameters, camera_array, projected, slots),
+        *_inputs(parameters, view),
         screen.gradients,
-        *([screen.contributions] if slots.fields.contributions else []),
+        *([screen.contributions] if view.slots.fields.contributions else []),
         *numbers[:weights],
         *bounds,
         *(config.beta1, config.beta2, config.epsilon),
@@ -322,11 +321,9 @@ def project_step(
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
         readback.buffer,  # a plain buffer: the profile must not count readback's bytes, which are rarely written
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
-        *projected.chunk_arguments,
+        *view.projected.chunk_arguments,
     )
-    build = _build(device)
-    defines |= build.defines | in_region
-    if build.lanes > 1:
+    if _lanes(device) > 1:
         kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
         launch_groups(device, kernel, -(-n // CPU_STEP_ROWS), 1, *arguments)
     else:
@@ -334,32 +331,24 @@ def project_step(
         launch_items(device, kernel, n, *arguments)
 
 
-class _Build(NamedTuple):
-    """How project_grad.cl is built.
-
-    lanes: number of Gaussians per work-item.
-    defines: the macro LANES, if `lanes` differs from the lanes of the kernel shape.
-    """
-
-    lanes: int
-    defines: dict[str, object]
+def _lanes(device: Device) -> int:
+    """Number of Gaussians per work-item. Gaussians that are evaluated along rays are computed with one lane."""
+    return 1 if device.switched("RAYS") else device.shape.lanes
 
 
-def _build(device: Device) -> _Build:
-    """Return how project_grad.cl is built. Gaussians that are evaluated along rays are computed with one lane."""
-    return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
+def _defines(
+    device: Device, gaussians: DeviceGaussians, view: ViewSlots, explore: Exploration, *, sh_rest: bool
+) -> dict[str, object]:
+    """The defines that `project_grad` and `project_step` share."""
+    wanted = {"ADDED_UP": view.slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
+    wanted |= {"PENALTIES": bool(explore.weights)}
+    defines = {**view.slots.fields.defines, **{name: True for name, needed in wanted.items() if needed}}
+    return {**defines, **view.projected.chunk_defines, **({"LANES": 1} if device.switched("RAYS") else {})}
 
 
-def _defines(gaussians: DeviceGaussians, slots: Slots, *, sh_rest: bool) -> dict[str, object]:
-    wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
-    return {**slots.fields.defines, **{name: True for name, needed in wanted.items() if needed}}
-
-
-def _inputs(
-    gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
-) -> tuple[object, ...]:
+def _inputs(gaussians: DeviceGaussians, view: ViewSlots) -> tuple[object, ...]:
     """The arguments that `project_grad` and `project_step` share, after the number of rows."""
     # If the slots are already summed, the kernel does not read first_slots, and tile_counts is a placeholder.
-    first_slots = slots.first_slots or projected.tile_counts
-    counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
-    return (gaussians.coefficients, camera_array, *counts)
+    projected, slots = view.projected, view.slots
+    counts = (projected.tile_counts, slots.first_slots or projected.tile_counts, slots.values, projected.splats)
+    return (gaussians.coefficients, view.camera_array, *counts)

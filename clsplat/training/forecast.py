@@ -32,8 +32,8 @@ RECENT_DENSIFICATIONS = 4
 PRIOR_GROWTH_WEIGHT = 0.5
 """Weight of the prior of the peak growth: it counts as much as this many measured densifications at the peak."""
 PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
-"""Prior of the parts of a step's time, relative to each other, as on CPUs: the constant part, then the time per pixel,
-per Gaussian, and per photograph that is read."""
+"""Prior of the parts of a step's time on CPUs, relative to each other. They are the constant part, then the time per
+pixel, per Gaussian, and per photograph that is read."""
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0

@@ -148,9 +148,8 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, unless the step has already changed the model.
 
-        Called after a failure of a kernel's trial or of the driver (such as a lost GPU), if device memory is used up
-        (out of memory), and if a photograph cannot be read. Returns the end of an error message, which names the
-        checkpoint, or "".
+        Called if a kernel's trial or the driver fails (as with a lost GPU), if device memory is used up, and if a
+        photograph cannot be read. Returns the end of an error message, which names the checkpoint, or "".
         """
         if self.run is None:
             return ""

@@ -210,7 +210,7 @@ class TrainedModel:
         for begin in range(0, len(changed), EXAMINED_CHUNKS):
             numbers = changed[begin : begin + EXAMINED_CHUNKS]
             rows = store.rows_of(numbers, KINDS, PARAMETER_GROUPS)
-            if np.any(examine(*(_host_arrays(rows[kind]) for kind in KINDS))):
+            if np.any(examine({kind: _host_arrays(rows[kind]) for kind in KINDS})):
                 return False
         return True
 

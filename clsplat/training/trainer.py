@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 
 class Trainer:
-    """A model in training: parameters, moments, statistics and random state, all of which a checkpoint contains.
+    """A model in training: parameters, moments, statistics and random state. A checkpoint contains all of these.
 
     position: step, random state and views left in the epoch.
     monitor: monitor of non-finite values in the model.

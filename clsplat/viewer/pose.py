@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera pose of a viewer's page: checks of what a browser sends, field of view, and the start position."""
+"""Camera pose of a viewer's page: checks of a browser's data, field of view, and the start position."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from clsplat.stages.adam import AdamStep
 from clsplat.stages.density import new_statistics
 from clsplat.stages.device_gaussians import HostGaussians, upload_gaussians
 from clsplat.stages.loss import loss
-from clsplat.stages.project import project_step
+from clsplat.stages.project import ViewSlots, project_step
 from clsplat.stages.target import target
 from clsplat.training.trainer import Trainer
 
@@ -181,9 +181,9 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     statistics = new_statistics(device, 6000, contributions=True)
     frame = rasterizer.forward(model, camera, background)
     photograph = target(device, rasterizer.work, np.zeros((80, 100, 4), np.float32), background)
-    result = loss(device, rasterizer.work, frame.blended.image, photograph, 100, 80, 0.2)
+    result = loss(device, rasterizer.work, frame.blended.image, photograph, (100, 80), 0.2)
     slots, screen = rasterizer.pair_gradients(frame, result.gradient, fields=fields), rasterizer.screen(6000, fields)
-    view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
+    view = (ViewSlots(frame.camera_array, frame.projected, slots), screen, rasterizer.readback)
     rates = dict.fromkeys(PARAMETER_GROUPS, 1e-3)
     project_step(device, AdamStep(OptimiserConfig(), 1, rates), (model, first, second), *view)
     assert len(frame.bands) == 1 if capacity is None else len(frame.bands) > 2

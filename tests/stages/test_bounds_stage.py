@@ -25,7 +25,7 @@ from clsplat.stages.bounds import bounds
 from clsplat.stages.chunk_lists import ChunkList, send_chunks
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
-from clsplat.stages.project import project, project_step
+from clsplat.stages.project import ViewSlots, project, project_step
 
 COUNTS = (1, CHUNK_ROWS - 1, CHUNK_ROWS, CHUNK_ROWS + 1, 5 * CHUNK_ROWS + 77)
 SHOWN = np.array([0, 2, 5], np.uint32)
@@ -131,7 +131,7 @@ def test_a_step_over_the_chunks_in_view(shaped_device: Device, optimiser: Optimi
         screen = rasterizer.screen(rows, FIELDS)
         readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
         step = AdamStep(optimiser, 6, {group: 10.0**-index for index, group in enumerate(PARAMETER_GROUPS, 1)})
-        view = (frame.camera_array, frame.projected, slots, screen, readback)
+        view = (ViewSlots(frame.camera_array, frame.projected, slots), screen, readback)
         project_step(shaped_device, step, model, *view)
         statistics = new_statistics(shaped_device, len(gaussians), contributions=True)
         statistics.current_totals.fill(1.0)

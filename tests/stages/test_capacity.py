@@ -22,7 +22,7 @@ from clsplat.stages.adam import AdamStep
 from clsplat.stages.density import add_statistics, new_statistics
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
-from clsplat.stages.project import project_step
+from clsplat.stages.project import ViewSlots, project_step
 from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS, Elements, scan
 from clsplat.stages.sort import MAX_BITONIC_KEYS, bitonic_sort, radix_sort
 
@@ -147,7 +147,7 @@ def test_a_pass_that_stops_changes_nothing(shaped_device: Device, cause: str) ->
     before = [model[group].get() for model in (held, *moments) for group in PARAMETER_GROUPS]
     gradient = upload(shaped_device, np.ones(frame.blended.image.shape, np.float32))
     slots, screen = rasterizer.pair_gradients(frame, gradient), rasterizer.screen(held.count, PLAIN_SLOTS)
-    view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
+    view = (ViewSlots(frame.camera_array, frame.projected, slots), screen, rasterizer.readback)
     project_step(shaped_device, AdamStep(OptimiserConfig(), 3, RATES), (held, *moments), *view)
     statistics = new_statistics(shaped_device, held.count)
     add_statistics(shaped_device, statistics, frame.camera, frame.projected, screen)

@@ -24,7 +24,7 @@ from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkList
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians
-from clsplat.stages.project import Projected, Screen, Slots, project_step
+from clsplat.stages.project import Projected, Screen, Slots, ViewSlots, project_step
 
 Arrays = dict[str, dict[str, NDArray[np.float32]]]
 """Parameters and both moments, by group."""
@@ -283,13 +283,10 @@ def test_bits_of_project_step(shaped_device: Device, every: int) -> None:
     _, camera = scenes.random_cloud(4, 11, 70, 50, degree=3)
     hidden = upload(device, np.zeros(count, np.uint32))
     projected = Projected(upload(device, np.zeros((count, len(SPLAT)), np.float32)), hidden)
-    view = (
-        upload(device, pack_camera(camera)),
-        projected,
-        Slots(upload(device, np.zeros((1, 9), np.float32)), hidden),
-        Screen(upload(device, np.zeros((count, 2), np.float32))),
-    )
+    slots = Slots(upload(device, np.zeros((1, 9), np.float32)), hidden)
+    view = ViewSlots(upload(device, pack_camera(camera)), projected, slots)
+    screen = Screen(upload(device, np.zeros((count, 2), np.float32)))
     for step in steps:
-        project_step(device, step, (parameters, first, second), *view, fresh_readback(device))
+        project_step(device, step, (parameters, first, second), view, screen, fresh_readback(device))
     got, _ = caught_up(device, arrays, steps, {0: 100})
     assert_alike(got, read((parameters, first, second)))

@@ -66,7 +66,7 @@ def test_the_fewest_rows_of_a_block(default_device: Device, monkeypatch: pytest.
 def test_equal_images_have_no_loss(shaped_device: Device) -> None:
     x = np.random.default_rng(0).random((20, 30, 3)).astype(np.float32)
     array = upload(shaped_device, planes_of(x))
-    value, squared = loss(shaped_device, Workspace(shaped_device), array, array, 30, 20, 0.2).read()
+    value, squared = loss(shaped_device, Workspace(shaped_device), array, array, (30, 20), 0.2).read()
     assert abs(value) < 1e-6
     assert squared == 0
 
@@ -115,7 +115,7 @@ def test_however_many_blocks_it_has_the_same_bits(shaped_device: Device, size: t
     width, height = size
     held, items = [], min(tile_items(shaped_device), 16)
     for device in (shaped_device.with_shape(lanes=1, items=items, chunks=1), shaped_device.with_shape(chunks=64)):
-        result = loss(device, Workspace(device), *noise(device, width, height), width, height, 0.2)
+        result = loss(device, Workspace(device), *noise(device, width, height), size, 0.2)
         held.append((result.gradient.get()[:, :height], result.read()))
     assert_same_bits(held[1][0], held[0][0])
     # sums of at most 1100 terms of up to 1 in float32, in another order
@@ -126,7 +126,7 @@ def test_launches_and_memory(shaped_device: Device) -> None:
     device = shaped_device.with_memory_limit(2**30)  # with an account of its own
     pictures = noise(shaped_device, 70, 100)
     with device.recorder.recording(wait=False) as stages:
-        result = loss(device, Workspace(device), *pictures, 70, 100, 0.2)
+        result = loss(device, Workspace(device), *pictures, (70, 100), 0.2)
     assert stages["loss"].launches == (1 if tile_items(device) == 1 else 2)
     assert device.memory.peak == scratch_bytes(device, 100, 80) + result.gradient.nbytes
 
@@ -150,7 +150,7 @@ def test_bright_flat_pictures_keep_their_digits(shaped_device: Device, brightnes
     waves = [np.sin(0.7 * columns + phase) * np.cos(rows) for phase in (0.0, 0.5)]
     x, y = (np.repeat((brightness + ripple * wave)[:, :, None], 3, axis=2).astype(np.float32) for wave in waves)
     work, arrays = Workspace(shaped_device), [upload(shaped_device, planes_of(image)) for image in (x, y)]
-    result = loss(shaped_device, work, *arrays, width, height, 0.2)
+    result = loss(shaped_device, work, *arrays, (width, height), 0.2)
     value, gradient = l1_dssim(x.astype(np.float64), y.astype(np.float64), 0.2)
     assert_close(result.read()[0], value, relative=1e-5)
     got = result.gradient.get()[:, :height, :width].transpose(1, 2, 0)

@@ -28,7 +28,7 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.selftest.harness import planes_of
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 from clsplat.stages.loss import loss
-from clsplat.stages.loss_terms import AlphaTerm, DepthTerm
+from clsplat.stages.loss_terms import AlphaTerm, DepthTerm, RenderTerms
 from clsplat.stages.target import target
 
 NEAR = SlotFields(nearness=True)
@@ -57,8 +57,8 @@ def stepped(
     aims, weights = aims_of(camera, seen.margin)
     depth = DepthTerm(planes_of(np.stack([aims, weights], axis=2)), 0.02)
     planes = target(device, rasterizer.work, photograph, frame.background, blended, alpha=alpha_weight > 0)
-    terms = (*([AlphaTerm(alpha_weight)] if alpha_weight else []), depth)
-    result = loss(device, rasterizer.work, blended.image, planes, *size, 0.2, blended=blended, terms=terms)
+    further = RenderTerms(blended, (*([AlphaTerm(alpha_weight)] if alpha_weight else []), depth))
+    result = loss(device, rasterizer.work, blended.image, planes, size, 0.2, further=further)
     gradients = allocate_gaussians(device, gaussians.means.shape[0], gaussians.sh.shape[1], zero=True)
     rasterizer.backward(model, frame, result.gradient, gradients, fields=fields)
     nearness = blended.nearness.get()[: camera.height, : camera.width]

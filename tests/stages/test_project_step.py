@@ -23,7 +23,7 @@ from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
-from clsplat.stages.project import Screen, Slots, add_slots, project_grad, project_step
+from clsplat.stages.project import Screen, Slots, ViewSlots, add_slots, project_grad, project_step
 
 EVERY_ROW = OptimiserConfig()
 RATES = {group: 10.0**-index for index, group in enumerate(PARAMETER_GROUPS, 1)}
@@ -129,19 +129,17 @@ def after_step(
 ) -> list[dict[str, NDArray[np.float32]]]:
     """Model, view and counts on the host, after a step."""
     parameters, first, second = model
-    camera_array, projected = frame.camera_array, frame.projected
-    count, coefficients = parameters.count, parameters.coefficients
+    projected, count, coefficients = frame.projected, parameters.count, parameters.coefficients
     readback = upload(device, np.zeros(len(READBACK), np.uint32))
     contributions = upload(device, np.zeros(count, np.float32)) if case.fields.contributions else None
     screen = Screen(upload(device, np.zeros((count, 2), np.float32)), contributions)
+    view = ViewSlots(frame.camera_array, projected, slots)
     if fused:
-        view = (camera_array, projected, slots, screen)
-        project_step(device, case.adam_step, model, *view, readback, explore=case.explore)
+        project_step(device, case.adam_step, model, view, screen, readback, explore=case.explore)
     else:
         gradients = allocate_gaussians(device, count, coefficients, zero=True)
-        view = (camera_array, projected, slots)
         also = {"sh_rest": case.adam_step.updates_sh_rest, "explore": case.explore}
-        project_grad(device, parameters, *view, gradients, screen, **also)
+        project_grad(device, parameters, view, gradients, screen, **also)
         models = (parameters, gradients, first, second)
         adam(device, case.adam_step, *models, projected.tile_counts, readback)
     view_arrays = {"screen": screen.gradients.get(), "counts": readback.get()}

@@ -47,7 +47,7 @@ from clsplat.stages.device_gaussians import (
     pooled,
     to_device,
 )
-from clsplat.stages.project import Projected, Screen, Slots, project, project_step
+from clsplat.stages.project import Projected, Screen, Slots, ViewSlots, project, project_step
 
 COUNT = 5 * CHUNK_ROWS + 77
 LISTED = np.array([0, 2, 3, 5], np.uint32)
@@ -143,7 +143,7 @@ def test_a_step_of_adam(shaped_device: Device, *, sparse: bool) -> None:
         camera_array, projected = seen(shaped_device, models[0], chunks, model.camera)
         screen = Screen(upload(shaped_device, np.zeros((chunks.rows, 2), np.float32)))
         slots, readback = made_slots(shaped_device, projected.tile_counts.get()), fresh_readback(shaped_device)
-        project_step(shaped_device, step, models, camera_array, projected, slots, screen, readback)
+        project_step(shaped_device, step, models, ViewSlots(camera_array, projected, slots), screen, readback)
         add_statistics(shaped_device, statistics, model.camera, projected, screen)
         results.append({"screen": screen.gradients.get(), "readback": readback.get()})
     moved = np.flatnonzero((model.whole[0]["means"].get() != before).any(axis=1))
@@ -190,17 +190,18 @@ def test_more_chunks_than_slots(shaped_device: Device, slots: int) -> None:
         assert_same_bits(some.tile_counts.get(), counts[: numbers.rows])
     pairs, readback = made_slots(shaped_device, counts), fresh_readback(shaped_device)
     screen = Screen(upload(shaped_device, np.zeros((len(counts), 2), np.float32)))
-    project_step(shaped_device, step, model.whole, camera_array, whole, pairs, screen, readback)
+    project_step(shaped_device, step, model.whole, ViewSlots(camera_array, whole, pairs), screen, readback)
     listed = []
     for start, stop, part, chunks in chunk_parts(model.work, numbers, *model.streamed, changes=True):
         of_part = LISTED[start // CHUNK_ROWS : stop // CHUNK_ROWS]
         assert (model.pool.slots_of(of_part) == chunks.numbers.get()).all()
         listed += of_part.tolist()
-        projected, of_screen = (
-            replace(some.rows(start, stop), chunks=chunks),
-            Screen(screen.gradients.rows(start, stop)),
+        projected = replace(some.rows(start, stop), chunks=chunks)
+        view, of_screen = (
+            ViewSlots(camera_array, projected, pairs.rows(start, stop)),
+            screen.gradients.rows(start, stop),
         )
-        project_step(shaped_device, step, part, camera_array, projected, pairs.rows(start, stop), of_screen, readback)
+        project_step(shaped_device, step, part, view, Screen(of_screen), readback)
     assert sorted(listed) == LISTED.tolist()
     assert not readback.get().any()
     model.check()

@@ -29,7 +29,7 @@ from clsplat.reference.render import forward, parameters, render_grad
 from clsplat.scenes.loading import load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians
 from clsplat.stages.loss import loss
-from clsplat.stages.loss_terms import AlphaTerm
+from clsplat.stages.loss_terms import AlphaTerm, RenderTerms
 from clsplat.stages.target import target
 from clsplat.training.supervision.image_cache import kept_pixels
 
@@ -48,9 +48,9 @@ def masked_step(device: Device, subject: tuple[Any, Any], image: np.ndarray, wei
     made, fields = Pipeline.run(device, subject), SlotFields(contributions=True)
     frame, rasterizer = made.frame, made.rasterizer
     planes = target(device, rasterizer.work, image, frame.background, frame.blended, alpha=weight > 0)
-    size, how = (made.camera.width, made.camera.height), {"kept": kept_pixels(image), "blended": frame.blended}
-    terms = (AlphaTerm(weight),) if weight else ()
-    result = loss(device, rasterizer.work, frame.blended.image, planes, *size, 0.2, terms=terms, **how)
+    size, kept = (made.camera.width, made.camera.height), kept_pixels(image)
+    further = RenderTerms(frame.blended, (AlphaTerm(weight),) if weight else ())
+    result = loss(device, rasterizer.work, frame.blended.image, planes, size, 0.2, kept=kept, further=further)
     gradients = allocate_gaussians(device, made.gaussians.count, made.gaussians.coefficients, zero=True)
     screen = rasterizer.backward(made.gaussians, frame, result.gradient, gradients, fields=fields)
     assert screen.contributions is not None

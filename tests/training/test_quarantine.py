@@ -30,7 +30,7 @@ from clsplat.runs.checkpoints import read_checkpoint, write_checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import sh_basis
-from clsplat.stages.device_gaussians import HostArray
+from clsplat.stages.device_gaussians import KINDS, HostArray
 from clsplat.training import repro_bundle
 from clsplat.training.stability import health
 from clsplat.training.stability.health import (
@@ -85,14 +85,15 @@ def model(count: int = 6) -> dict[str, HostArray]:
 
 
 def test_what_is_broken_and_what_is_refused() -> None:
-    parameters, first, second = model(), model(), model()
-    assert not np.any(examine(parameters, first, second))
+    models = {kind: model() for kind in KINDS}
+    parameters, first, second = models.values()
+    assert not np.any(examine(models))
     parameters["means"].values[1, 2] = np.nan
     parameters["sh_rest"].values[2, 1, 0] = -MAX_SH_COEFFICIENT
     parameters["means"].values[3] = 1e18  # far away, but a place
     first["sh_dc"].values[4, 1] = np.inf
     second["opacity_logits"].values[5] = np.nan
-    broken, refused = examine(parameters, first, second)
+    broken, refused = examine(models)
     assert broken.tolist() == [False, True, True, False, False, False]
     assert refused.tolist() == [False, False, False, False, True, True]
     assert lost("loss", broken, refused).tolist() == [False, True, True, False, False, False]
@@ -106,14 +107,14 @@ def test_what_is_broken_and_what_is_refused() -> None:
 
 def test_gaussians_are_examined_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(health, "EXAMINED_ROWS", 500)
-    parameters, first, second = model(2001), model(2001), model(2001)
+    models = {kind: model(2001) for kind in KINDS}
     rows = [0, 499, 500, 1999, 2000]
-    parameters["opacity_logits"].values[rows] = np.nan
-    second["sh_rest"].values[rows] = np.inf
-    for found in examine(parameters, first, second):
+    models["parameters"]["opacity_logits"].values[rows] = np.nan
+    models["second"]["sh_rest"].values[rows] = np.inf
+    for found in examine(models):
         assert np.flatnonzero(found).tolist() == rows
-    most = peak_of(lambda: examine(parameters, first, second))
-    assert most < parameters["sh_rest"].values.nbytes / 2, (
+    most = peak_of(lambda: examine(models))
+    assert most < models["parameters"]["sh_rest"].values.nbytes / 2, (
         "a part is a quarter; all would be all of it, and their marks"
     )
 

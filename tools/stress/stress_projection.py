@@ -85,7 +85,8 @@ def there_and_back(
     screen.gradients.fill(np.nan)
     slots = stages_project.Slots(upload(device, sums))
     assert sums.shape[1] == PLAIN_SLOTS.floats
-    stages_project.project_grad(device, gaussians, camera, projected, slots, gradients, screen, by_lens=by_lens)
+    view = stages_project.ViewSlots(camera, projected, slots)
+    stages_project.project_grad(device, gaussians, view, gradients, screen, by_lens=by_lens)
     return projected, gradients, screen.gradients
 
 

@@ -21,10 +21,10 @@ FACES_PER_SOLID = 8
 """Number of rows of a solid in the table of faces. A box uses the first six, for the faces -x, +x, -y, +y, -z and +z. A
 roof has the faces -x, +x and -z, and its two slopes in the last two rows. A ball uses only the first row."""
 FACE_VALUES = 18
-"""Number of values in the row of a face, with plane n p = d and texture coordinates u = U p + u0 and v = V p + v0.
+"""Number of values in a face's row. The face's plane is n p = d, its texture coordinates u = U p + u0, v = V p + v0.
 
-The values are n (3), d, U (3), u0, V (3), v0, red, green and blue of its light, the index of its texture, log2 of
-texels per metre, and darkness at the ground.
+The values are n (3), d, U (3), u0, V (3), v0, then red, green and blue of the face's light. The last three are the
+index of its texture, log2 of texels per metre, and darkness at the ground.
 """
 PLANE_AT, U_AT, V_AT, LIGHT_AT, TEXTURE_AT, DENSITY_AT, DARKNESS_AT = 0, 4, 8, 12, 15, 16, 17
 """Indices of values in the row of a face (FACE_VALUES)."""

@@ -15,7 +15,7 @@ Signs = tuple[int, int, int]
 
 RUB_SIGNS: Signs = (1, -1, -1)
 """Factors of x, y and z that convert between clsplat's axes (x right, y down, z forward) and RUB (x right, y up, z
-back), the y-up axes of glTF: half a turn about x."""
+back). RUB are the y-up axes of glTF; the conversion is half a turn about x."""
 LUF_SIGNS: Signs = (-1, -1, 1)
 """Factors of x, y and z that convert between clsplat's axes and LUF (x left, y up, z forward): half a turn about z."""
 

@@ -54,9 +54,9 @@ ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 LENGTH_SKEW_RATIO = 3.0
 """Ratio of (99th percentile - median) to (median - 1st percentile), above which values are lengths and not logs.
 
-The logs of a model's lengths have a standard deviation of 1 or more. If they are normally distributed, the ratio of the
-lengths is then e^2.33 = 10 or more (the 99th percentile is 2.33 standard deviations above the median), and the ratio of
-the logs is about 1.
+The logs of a model's lengths have a standard deviation of 1 or more. If they are normally distributed, the 99th
+percentile is 2.33 standard deviations above the median. The ratio of the lengths is then e^2.33 = 10 or more, and the
+ratio of the logs is about 1.
 """
 
 

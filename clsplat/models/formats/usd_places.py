@@ -319,8 +319,8 @@ class _StageFindings:
 def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[UsdPlacement], list[str]]:
     """Placements of all prims of the types `kinds`, in the stage's order, and descriptions of prims that are not drawn.
 
-    Descriptions are of prims that other USD renderers would draw but clsplat does not, of prims with Gaussians that no
-    instance draws, and of prims that refer to a file that cannot be opened. Raises InputError, prefixed with `where`.
+    Descriptions are of prims that clsplat does not draw but other USD renderers do, of Gaussians that no instance
+    draws, and of prims whose file cannot be opened. Raises InputError, prefixed with `where`.
     """
     from pxr import Usd
 

@@ -69,9 +69,9 @@ SPARSE_TRAINING_VIEWS = 30
 MAX_GAUSSIANS_PER_POINT, MIN_PIXELS_PER_GAUSSIAN = 12, 64
 """Maximum number of Gaussians per point, and minimum number of pixels per Gaussian, for scenes with few photographs.
 
-A Gaussian has up to 59 parameters. A pixel has three values, most of which resemble its neighbours' values. The results
-are best with 64 to 85 pixels per Gaussian for 25 photographs of bonsai, and with 7 Gaussians per point for the 50
-photographs of fox (docs/quality.md, Few photographs and Growth).
+A Gaussian has up to 59 parameters. A pixel has three values, and most pixels resemble their neighbours. For 25
+photographs of bonsai, results are best with 64 to 85 pixels per Gaussian; for 50 of fox, with 7 Gaussians per point
+(docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
 """Minimum of the recommended number of Gaussians, as a multiple of the number of points.

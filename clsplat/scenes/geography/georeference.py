@@ -84,7 +84,7 @@ class Georeference:
     origin: (3,), coordinates of the world's origin in the reference system.
     transform: (3, 3), rotation times scale from the world to the reference system.
     residuals: distances of the cameras from GPS positions; None if these are unknown.
-    note: what the georeference comes from, for the user.
+    note: source of the georeference, for the user.
     """
 
     epsg: int

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Upright frame of a scene: up along -y, the ground at y = 0, and the middle of the scene at x = z = 0.
 
-Up comes from the first of these that is known: gravity in the metadata, GPS positions of a wide capture, a level
-plane of points near the cameras' up, the cameras alone.
+Up comes from the first of these that is known: gravity in the metadata, GPS positions of a wide capture, a level plane
+of points near the cameras' up. Otherwise it comes from the cameras alone.
 """
 
 from __future__ import annotations

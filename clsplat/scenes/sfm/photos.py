@@ -126,7 +126,7 @@ def find_photos(
 def _no_photos(
     folder: Path, lacking: Sequence[Path], others: Sequence[Path], broken: Sequence[Path], made: Sequence[Path]
 ) -> InputError:
-    """Return the error for a folder without photographs, which names what is there instead.
+    """Return the error for a folder without photographs, which names the files and folders that are there instead.
 
     lacking: photographs whose decoder is not installed. others: photographs in unsupported formats.
     broken: broken links. made: folders that clsplat made.

@@ -63,7 +63,7 @@ class SfmSettings:
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
-    max_features: maximum number of features in a photograph, of which the largest are kept.
+    max_features: maximum number of features in a photograph; the largest are kept.
     mapper: "incremental" adds one photograph after another. "global" solves for all cameras at once. "auto" is
         "incremental", and also "global" if "incremental" places less than 60 % of the photographs. Of more than 40
         photographs with fewer than 5 for each camera, "global" is first.

@@ -153,8 +153,8 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
     """Raise InputError for points (N, 3) of a cloud that do not fit the scene's cameras.
 
-    Either hardly any of the points is in a training photograph, or they are much nearer to the cameras that see them,
-    or farther, than the scene's own points, by the median distance.
+    Points fit if enough of them are in a training photograph. Their median distance from the cameras that see them must
+    be close to the median distance of the scene's own points.
     """
     sample = _spread(points)
     seen, depths = _seen(sample, scene)

@@ -44,7 +44,7 @@ than this fraction of the white pixels."""
 class Mask:
     """The mask of a photograph: a file, the photograph's alpha, or both.
 
-    use: what masked pixels mean, in the file and in alpha: ignored or transparent.
+    use: meaning of masked pixels, in the file and in alpha: ignored or transparent.
     path: the mask file, if there is one.
     """
 

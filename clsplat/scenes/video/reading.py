@@ -105,7 +105,7 @@ class VideoFrame:
 
 @dataclass
 class VideoReader:
-    """A video that is open for reading. `trouble` lists what was found damaged, for messages."""
+    """A video that is open for reading. `trouble` lists the damage that was found, for messages."""
 
     path: Path
     facts: VideoFacts

@@ -48,15 +48,6 @@ def random_moments(rng: Generator, shape: tuple[int, ...], size: float) -> Float
     return (moments * (rng.random() > 1 / 3)).astype(np.float32)
 
 
-def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) -> Inputs:
-    """The scene's blended image as the render, a photograph, and the loss's gradient with respect to the render."""
-    image = bench.blended.image.get()
-    photograph = evenly(photograph_seed, image.shape, 0.0, 1.0).astype(np.float32)
-    by_image = evenly(gradient_seed, image.shape, -0.25, 1.0).astype(np.float32)
-    planes = {"image": image, "photograph": photograph, "by_image": by_image}
-    return Inputs(**{name: cropped(each, bench.camera) for name, each in planes.items()})
-
-
 def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs:
     """Random inputs of a colour model.
 
@@ -84,17 +75,24 @@ def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs
 
 
 def _frozen(model: ColourModel, bench: CaseBench) -> list[Inputs]:
-    """Inputs with three photographs and two lenses, of which photograph 1 and lens 1 are used.
+    """Inputs from the self-test's scene, with three photographs and two lenses: photograph 1 and lens 1 are used.
 
     In a colour model that has gains alone, the gradient has a term that pulls the gains of photographs 0 and 1 towards
     their initial values `start`.
     """
     pulled = model.sums == GAIN_ENTRIES
-    pictures, seed, end = ((45, 42), 41, 1.0) if pulled else ((48, 49), 46, 0.125)
-    entries = evenly(seed, (3, model.entries), -end, end).astype(np.float32)
+    seeds, end = ((45, 42, 41), 1.0) if pulled else ((48, 49, 46), 0.125)
+    image = bench.blended.image.get()
+    photograph = evenly(seeds[0], image.shape, 0.0, 1.0).astype(np.float32)
+    by_image = evenly(seeds[1], image.shape, -0.25, 1.0).astype(np.float32)
+    image, photograph, by_image = (cropped(each, bench.camera) for each in (image, photograph, by_image))
+    entries = evenly(seeds[2], (3, model.entries), -end, end).astype(np.float32)
     pull = pulled * evenly(44, (3, 3), 0.0, 0.5).astype(np.float32)
     pull[2] = pull[:, 2] = 0
-    learnt = Inputs(
+    given = Inputs(
+        image=image,
+        photograph=photograph,
+        by_image=by_image,
         taken=PhotoLens(photograph=1, lens=1, centre=(0.4375, 0.5625)),
         entries=entries,
         start=evenly(43, (3, model.entries), -1.0, 1.0).astype(np.float32) if pulled else entries,
@@ -105,7 +103,7 @@ def _frozen(model: ColourModel, bench: CaseBench) -> list[Inputs]:
         number=5,
         rate=0.03125,
     )
-    return [Inputs(**vars(frozen_pictures(bench, *pictures)), **vars(learnt))]
+    return [given]
 
 
 def _gains(device: Device, entries: Float32, moments: Sequence[Float32], pull: csr_array | None = None) -> Gains:
@@ -126,10 +124,11 @@ def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) 
     step = (columns, given.number, given.rate, fresh_readback(device))
     step_gains(device, colours, given.taken.photograph, *step, GainEntries(mix_rate=MIX_RATE_FACTOR))
     made = {"entries": colours.logs, "start": colours.start, "gains": colours.gains, "columns": columns}
+    made |= {"first": colours.first, "second": colours.second}
     if lenses is not None:
         step_gains(device, lenses, given.taken.lens, *step, GainEntries.of_lens(model))
         made["lenses"] = lenses.logs
-    read = read_of(**made, first=colours.first, second=colours.second)
+    read = read_of(made)
     return lambda: {**read(), **_pictures_read(given, target, gradient)}
 
 

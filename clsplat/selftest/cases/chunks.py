@@ -34,7 +34,7 @@ from clsplat.stages.chunk_pool import copy_chunks
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
-from clsplat.stages.project import Projected, Screen, Slots, project, project_grad, project_step
+from clsplat.stages.project import Projected, Screen, Slots, ViewSlots, project, project_grad, project_step
 
 SIZES = (1, CHUNK_ROWS + 1, CHUNK_ROWS, 3 * CHUNK_ROWS + 129, 65)
 
@@ -193,11 +193,11 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     counts[len(rows) :] = 0
     some = Projected(some.splats, upload(device, counts), chunks=chunks)
     screen = Screen(upload(device, np.zeros((chunks.rows, 2), np.float32)), by_row)
-    view = (camera_array, some, _slots(device, some, given.slots[rows]), screen)
+    view = ViewSlots(camera_array, some, _slots(device, some, given.slots[rows]))
     step = AdamStep(OptimiserConfig(sparse=given.sparse), STEP, ADAM_RATES)
-    read_batch = _launch_batch(device, given, chunks, view, step)
+    read_batch = _launch_batch(device, given, chunks, view, screen, step)
     model = (held, *uploaded_groups(device, given.moments))
-    project_step(device, step, model, *view, fresh_readback(device))
+    project_step(device, step, model, view, screen, fresh_readback(device))
     statistics = new_statistics(device, held.count, contributions=True)
     statistics.load({name: np.full(held.count, BEGIN, np.float32) for name in CURRENT})
     add_statistics(device, statistics, given.camera, some, screen)
@@ -218,17 +218,17 @@ def _launch_batch(
     device: Device,
     given: Inputs,
     chunks: ChunkList,
-    view: tuple[DeviceArray, Projected, Slots, Screen],
+    view: ViewSlots,
+    screen: Screen,
     step: AdamStep,
 ) -> Read:
     """Take the step with kernels of a step of several views: gradients of the listed chunks, their sums, then Adam."""
     parameters, (first, second) = upload_gaussians(device, given.gaussians), uploaded_groups(device, given.moments)
     gradients, sums = (allocate_gaussians(device, chunks.rows, parameters.coefficients, zero=True) for _ in range(2))
-    camera_array, projected, slots, screen = view
-    project_grad(device, parameters, camera_array, projected, slots, gradients, screen)
+    project_grad(device, parameters, view, gradients, screen)
     places = np.arange(chunks.numbers.shape[0], dtype=np.uint32)
     in_sums = ChunkList(upload(device, places[::-1].copy()), sums.count)  # another order than that of the view
-    add_view(device, projected.tile_counts, gradients, sums, places=in_sums)
+    add_view(device, view.projected.tile_counts, gradients, sums, places=in_sums)
     listed = ChunkList(upload(device, chunks.numbers.get()[::-1].copy()), chunks.model_rows)
     adam(device, step, parameters, sums, first, second, chunks=listed)
     model = (parameters, first, second)
@@ -240,9 +240,10 @@ def _launch_whole(device: Device, given: Inputs, held: DeviceGaussians, camera_a
     whole = project(device, Workspace(device), held, given.camera, camera_array)
     gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
     screen = Screen(upload(device, np.zeros((held.count, 2), np.float32)))
-    project_grad(device, held, camera_array, whole, _slots(device, whole, given.slots), gradients, screen)
+    view = ViewSlots(camera_array, whole, _slots(device, whole, given.slots))
+    project_grad(device, held, view, gradients, screen)
     arrays = {"whole counts": whole.tile_counts, "whole splats": whole.splats, "whole screen": screen.gradients}
-    return lambda: {**read_of(**arrays)(), **{g: gradients[g].get() for g in PARAMETER_GROUPS}}
+    return lambda: {**read_of(arrays)(), **{g: gradients[g].get() for g in PARAMETER_GROUPS}}
 
 
 def _flat(model: DeviceGaussians) -> Array:

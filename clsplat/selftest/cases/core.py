@@ -229,7 +229,7 @@ def _project_grad(bench: CaseBench) -> StageOutcome:
     def launch() -> tuple[DeviceGaussians, Screen]:
         gradients = allocate_gaussians(device, n, coefficients, zero=True)
         screen = Screen(bench.work.array("screen", (n, 2)))
-        project_grad(device, bench.model, bench.camera_array, bench.projected, made.slots, gradients, screen)
+        project_grad(device, bench.model, made.view, gradients, screen)
         return gradients, screen
 
     def take(results: tuple[DeviceGaussians, Screen]) -> list[Array]:
@@ -259,18 +259,16 @@ def _adam(bench: CaseBench) -> StageOutcome:
 def _steps_off(bench: CaseBench, given: Inputs) -> int:
     """Count the elements in which `project_step` differs from float64 Adam with the gradients of `project_grad`."""
     device, (n, coefficients) = bench.device, (bench.model.count, bench.model.coefficients)
-    view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
-    gradients, screen = (
-        allocate_gaussians(device, n, coefficients, zero=True),
-        Screen(bench.work.array("screen", (n, 2))),
-    )
-    project_grad(device, bench.model, *view, gradients, screen)
+    view = MadeUpSlots.of(bench).view
+    gradients = allocate_gaussians(device, n, coefficients, zero=True)
+    screen = Screen(bench.work.array("screen", (n, 2)))
+    project_grad(device, bench.model, view, gradients, screen)
     before = {"parameters": {group: bench.model[group].get() for group in PARAMETER_GROUPS}}
     before |= {kind: dict(given.arrays[kind]) for kind in ("first", "second")}
     parameters, first, second = uploaded_groups(device, before)
     sparse = given.rows == "sparse"
     readback, step = fresh_readback(device), AdamStep(OptimiserConfig(sparse=sparse), given.step, given.rates)
-    project_step(device, step, (parameters, first, second), *view, screen, readback)
+    project_step(device, step, (parameters, first, second), view, screen, readback)
     wrong = int(readback.get().sum())
     for group, rate in given.rates.items():
         p, m, v = (before[kind][group].astype(np.float64) for kind in before)

@@ -43,12 +43,12 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """Inputs from the self-test's scene: the blended image, and grids of two photographs, of which one is used."""
+    """Inputs from the self-test's scene: the blended image, and grids of two photographs; one is used."""
     grids = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
     by_seen = evenly(44, tuple(bench.blended.image.shape), -0.25, 1.0).astype(np.float32)
     image, by_seen = (cropped(each, bench.camera) for each in (bench.blended.image.get(), by_seen))
-    step = {"moments": np.zeros((2, *grids.shape), np.float32), "weight": 10.0, "visit": 5, "rate": 0.03125}
-    return [Inputs(image=image, by_seen=by_seen, grids=grids, **step)]
+    moments = np.zeros((2, *grids.shape), np.float32)
+    return [Inputs(image=image, by_seen=by_seen, grids=grids, moments=moments, weight=10.0, visit=5, rate=0.03125)]
 
 
 def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
@@ -60,7 +60,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     by_grid = grid_gradient(device, work, *own, gradient, *given.size, given.weight)
     step_grid(device, grids, GRID_PHOTOGRAPH, by_grid, given.visit, given.rate, readback)
     centre_grids(device, grids, readback)
-    read = read_of(**{"grids": grids.grids, "first": first, "second": second, "by grid": by_grid})
+    read = read_of({"grids": grids.grids, "first": first, "second": second, "by grid": by_grid})
     planes = {"seen": seen, "gradient": gradient}
     return lambda: {**read(), **{name: cropped(array.get(), given.size) for name, array in planes.items()}}
 

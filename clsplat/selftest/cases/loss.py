@@ -22,7 +22,7 @@ from clsplat.selftest.scenes import evenly, padded
 from clsplat.stages.blend import Blended, blend, blend_grad, tile_items
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.loss import Loss, loss
-from clsplat.stages.loss_terms import AlphaTerm, DepthTerm
+from clsplat.stages.loss_terms import AlphaTerm, DepthTerm, RenderTerms
 from clsplat.stages.target import target
 
 Size = tuple[int, int]
@@ -80,12 +80,12 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     """
     size, background = given.size, upload(device, np.zeros(3, np.float32))
     image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
-    first = _read(loss(device, work, image, photograph, *size, given.weight), size)
+    first = _read(loss(device, work, image, photograph, size, given.weight), size)
 
     def again(source: Array) -> float:
         """Return the number of results that change if the kernel reads the interleaved photograph `source`."""
         as_loaded = target(device, work, source, background, in_planes=False)
-        second = _read(loss(device, work, image, as_loaded, *size, given.weight), size)
+        second = _read(loss(device, work, image, as_loaded, size, given.weight), size)
         return float(sum(np.count_nonzero(second[name] != first[name]) for name in first))
 
     levels = np.rint(given.photograph * 255).astype(np.uint8)
@@ -156,8 +156,8 @@ def _frozen_masks(bench: CaseBench) -> list[Inputs]:
 def _launch_masks(device: Device, work: Workspace, given: Inputs) -> Read:
     blended = _blended(device, given.size, given.image, given.left)
     planes = target(device, work, given.photograph, upload(device, given.background), blended, alpha=True)
-    kept, terms = int(given.photograph[:, :, 4].sum()), (AlphaTerm(ALPHA_LOSS_WEIGHT),)
-    result = loss(device, work, blended.image, planes, *given.size, 0.2, kept=kept, blended=blended, terms=terms)
+    kept, further = int(given.photograph[:, :, 4].sum()), RenderTerms(blended, (AlphaTerm(ALPHA_LOSS_WEIGHT),))
+    result = loss(device, work, blended.image, planes, given.size, 0.2, kept=kept, further=further)
 
     def read() -> Arrays:
         by_left = cropped(result.gradient.get(), given.size)[:, :, 3]
@@ -209,8 +209,7 @@ def _launch_depth_loss(device: Device, work: Workspace, given: Inputs) -> Read:
     size = given.size
     blended = _blended(device, size, given.image, np.zeros_like(given.nearness), given.nearness)
     known = DepthTerm(planes_of(np.stack([given.aims, given.weights], axis=2)), given.factor)
-    render = blended.image
-    result = loss(device, work, render, render, *size, 0.2, blended=blended, terms=(known,))
+    result = loss(device, work, blended.image, blended.image, size, 0.2, further=RenderTerms(blended, (known,)))
     return lambda: {
         "gradient": cropped(result.gradient.get(), size)[:, :, 3],
         "loss": np.array([result.read()[0]]),
@@ -248,9 +247,8 @@ def of_depth(bench: CaseBench) -> StageOutcome:
 
     def launch() -> tuple[Blended, Loss]:
         blended = blend(device, bench.work, bench.lists, bench.inputs, nearness=True)
-        return blended, loss(
-            device, bench.work, blended.image, photograph, width, height, 0.2, blended=blended, terms=(aims,)
-        )
+        pictures, further = (blended.image, photograph), RenderTerms(blended, (aims,))
+        return blended, loss(device, bench.work, *pictures, (width, height), 0.2, further=further)
 
     def take(made: tuple[Blended, Loss]) -> list[Array]:
         assert made[0].nearness is not None

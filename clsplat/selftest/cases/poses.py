@@ -88,8 +88,7 @@ def of_lens(bench: CaseBench) -> StageOutcome:
         screen, by_lens = (
             bench.work.array(name, (model.count, width)) for name, width in (("screen", 2), ("lens", LENS_NUMBERS))
         )
-        view = (bench.camera_array, bench.projected, made.slots, gradients, Screen(screen))
-        project_grad(device, model, *view, by_lens=by_lens)
+        project_grad(device, model, made.view, gradients, Screen(screen), by_lens=by_lens)
         sums = sums_of(bench.work, model.count, LENS_NUMBERS)
         lens_rows(device, bench.projected.tile_counts, by_lens, sums)
         return sum_of(device, bench.work, sums)

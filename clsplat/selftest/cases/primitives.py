@@ -97,7 +97,7 @@ def _launch_sort(device: Device, work: Workspace, given: Inputs) -> Read:
         found = bitonic_sort(device, work, "sorted", values)
     else:
         found = radix_sort(device, work, "sorted", values, given.bits, given.base)
-    return read_of(keys=found[0], places=found[1])
+    return read_of({"keys": found[0], "places": found[1]})
 
 
 def _twin_of_sort(given: Inputs, _: Arrays) -> dict[str, Expected]:
@@ -125,7 +125,7 @@ def _launch_scan(device: Device, work: Workspace, given: Inputs) -> Read:
     values, total = upload(device, given.values), upload(device, np.full(1, 7, np.uint32))
     out = values if given.in_place else upload(device, np.full(len(given.values), 0xFFFFFFFF, np.uint32))
     scan(device, work, values, out, total)
-    return read_of(sums=out, total=total)
+    return read_of({"sums": out, "total": total})
 
 
 SCAN_CASE = Case(

@@ -23,7 +23,7 @@ from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_camera import pack_camera, upload_cameras
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.noise import noise
-from clsplat.stages.project import Screen, Slots, project, project_grad, project_step
+from clsplat.stages.project import Screen, Slots, ViewSlots, project, project_grad, project_step
 from clsplat.stages.sampling import sampling_limits
 
 FIELDS = SlotFields(contributions=True)
@@ -49,7 +49,9 @@ def _random(rng: Generator, count: int) -> Inputs:
     means[rng.random(count) < 0.02] = np.nan
     high = np.where(low < high, high, low + 1)
     return Inputs(
-        **vars(given),
+        gaussians=given.gaussians,
+        camera=given.camera,
+        explore=given.explore,
         region=TrainedRegion(axes, low, high, middle, nearest, farthest),
         slots=rng.normal(size=(count, FIELDS.floats)).astype(np.float32),
         sparse=bool(rng.random() < 0.3),
@@ -82,17 +84,17 @@ def _results(device: Device, work: Workspace, given: Inputs, region: TrainedRegi
     count, coefficients = model.count, model.coefficients
     unwritten = [np.full(shape, np.nan, np.float32) for shape in ((count, 2), (count,), (count, 2), (count,))]
     on_screen, contributions, on_screen_of_step, further = (upload(device, array) for array in unwritten)
-    view = (camera_array, projected, Slots(upload(device, given.slots), None, FIELDS))
+    view = ViewSlots(camera_array, projected, Slots(upload(device, given.slots), None, FIELDS))
 
     gradients = allocate_gaussians(device, count, coefficients, zero=True)
     screen = Screen(on_screen, contributions)
-    project_grad(device, model, *view, gradients, screen, explore=given.explore, region=region)
+    project_grad(device, model, view, gradients, screen, explore=given.explore, region=region)
 
     stepped = upload_gaussians(device, given.gaussians)
     moments = (allocate_gaussians(device, count, coefficients, zero=True) for _ in range(2))
     step = AdamStep(OptimiserConfig(sparse=given.sparse), 1, ADAM_RATES)
     target = (Screen(on_screen_of_step, further), fresh_readback(device))
-    project_step(device, step, (stepped, *moments), *view, *target, explore=given.explore, region=region)
+    project_step(device, step, (stepped, *moments), view, *target, explore=given.explore, region=region)
 
     limits, moved = allocate(device, (count,), np.float32), upload_gaussians(device, given.gaussians)
     sampling_limits(device, work, model, upload_cameras(device, [given.camera]), limits, region)
@@ -113,7 +115,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     """Run the kernels without a region and with one."""
     results = _results(device, work, given, None)
     inside = _results(device, work, given, given.region)
-    return read_of(**results, **{f"in region {name}": array for name, array in inside.items()})
+    return read_of(results | {f"in region {name}": array for name, array in inside.items()})
 
 
 def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:

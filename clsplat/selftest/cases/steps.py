@@ -28,7 +28,7 @@ from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.noise import highest_logit, noise
-from clsplat.stages.project import Screen, Slots, project, project_grad
+from clsplat.stages.project import Screen, Slots, ViewSlots, project, project_grad
 from clsplat.stages.settle import settle
 
 ADAM_ENDS = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
@@ -259,8 +259,7 @@ def _launch_noise(device: Device, _: Workspace, given: Inputs) -> Read:
     count = len(given.opacity_logits)
     # The means are 0, so that adding the noise rounds nothing.
     means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)
-    arrays = {name: getattr(given, name) for name in GEOMETRY_ARRAYS}
-    held = upload_gaussians(device, Gaussians(means=means, sh=sh, **arrays))
+    held = upload_gaussians(device, Gaussians(means, given.quaternions, given.log_scales, given.opacity_logits, sh))
     noise(device, given.explore, held, 0, fresh_readback(device))
     return lambda: {name: held[name].get() for name in ("means", *GEOMETRY_ARRAYS)}
 
@@ -311,7 +310,7 @@ def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
     gradients = allocate_gaussians(device, model.count, model.coefficients, zero=True)
     slots = Slots(upload(device, np.zeros((model.count, SLOT_PLAIN), np.float32)))
     screen = Screen(upload(device, np.zeros((model.count, 2), np.float32)))
-    project_grad(device, model, camera_array, projected, slots, gradients, screen, explore=given.explore)
+    project_grad(device, model, ViewSlots(camera_array, projected, slots), gradients, screen, explore=given.explore)
     return lambda: {
         **{group: gradients[group].get() for group in PARAMETER_GROUPS},
         "shown": projected.tile_counts.get() > 0,

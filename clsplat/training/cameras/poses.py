@@ -108,8 +108,8 @@ def descend(first: Float64, second: Float64, gradient: Float64, visit: int) -> F
 class Poses:
     """Cameras of the training views, which move if poses are refined.
 
-    Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view
-    whose camera is not an outlier, and the view farthest from it among such views.
+    Adam has moments for each view. Two views do not move, so that the model keeps its place and size. They are the
+    first view whose camera is not an outlier, and the view farthest from it among such views.
 
     held: indices of the two views that do not move; empty if poses are not refined.
     """

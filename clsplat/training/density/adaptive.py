@@ -188,9 +188,9 @@ def weakest(scores: Float32, count: int) -> tuple[float, int]:
 def budget(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's densification, from `count` before it.
 
-    In Taming 3DGS (Mallick et al. 2024), A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N is the number of
-    Gaussians after x of N densifications, from S at first to B at last. This equals B - (B - S)(1 - x/N)^2. So each
-    densification reduces the gap to B, here max_gaussians, by a known ratio, even if Gaussians were pruned in between.
+    In Taming 3DGS (Mallick et al. 2024), A(x) = B - (B - S)(1 - x/N)^2 is the number of Gaussians after x of N
+    densifications, from S at first to B at last. So each densification reduces the gap to B, here max_gaussians, by a
+    known ratio, even if Gaussians were pruned in between.
     """
     last = (config.stop - 1) // config.every * config.every
     before = max(step - config.every, config.start)

@@ -47,19 +47,21 @@ Model = Mapping[str, Rows]
 """Arrays of the parameters, or of one of their moments, by parameter group."""
 
 
-def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def examine(models: Mapping[str, Model]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return two masks (n,): Gaussians with a broken parameter, and Gaussians with a non-finite moment.
 
     A parameter is broken if it is not finite or over its limit. `adam` also writes a non-finite moment to mark a step
     that it has refused.
+
+    models: the "parameters", and their moments "first" and "second".
     """
-    count = parameters["means"].shape[0]
+    count = models["parameters"]["means"].shape[0]
     broken, refused = np.zeros(count, bool), np.zeros(count, bool)
     for start in range(0, count, EXAMINED_ROWS):
         stop = min(start + EXAMINED_ROWS, count)
-        for group, values in parameters.items():
+        for group, values in models["parameters"].items():
             broken[start:stop] |= _over(values.get_rows(start, stop), PARAMETER_GROUPS[group].limit)
-        for values in (*first.values(), *second.values()):
+        for values in (*models["first"].values(), *models["second"].values()):
             refused[start:stop] |= _any_in_row(~np.isfinite(values.get_rows(start, stop)))
     return broken, refused
 

@@ -121,14 +121,14 @@ class NonFiniteMonitor:
 
         models: arrays by parameter group, of the "parameters" and of the moments "first" and "second".
         """
-        if self.last is None or self.retries.lost or not np.any(health.examine(**models)):
+        if self.last is None or self.retries.lost or not np.any(health.examine(models)):
             return None
         return self._judge(self.last, "parameters", 0, models)
 
     def _judge(
         self, last: LastStep, stage: str, elements: int, models: Mapping[str, Mapping[str, AnyArray]]
     ) -> Repair | None:
-        broken, refused = health.examine(**models)
+        broken, refused = health.examine(models)
         lost = health.lost(stage, broken, refused)
         concerned = np.flatnonzero(broken | refused)
         hopeless = bool(np.mean(lost) > health.MAX_BROKEN_FRACTION)

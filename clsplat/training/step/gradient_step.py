@@ -22,7 +22,7 @@ from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, chunk_parts, parts
 from clsplat.stages.loss import Loss, loss
-from clsplat.stages.loss_terms import LossTerm
+from clsplat.stages.loss_terms import LossTerm, RenderTerms
 from clsplat.stages.noise import noise, noise_numbers
 from clsplat.stages.project import Projected, Slots, project_grad, project_step, step_numbers, thinning_numbers
 from clsplat.stages.target import is_photograph, on_device, target
@@ -230,19 +230,10 @@ class GradientStep:
         for part in inputs.parts:
             image = part.compare(work, image, planes, size)
 
+        weight, further = self.config.dssim_weight, RenderTerms(frame.blended, terms)
+
         def compared() -> Loss:
-            return loss(
-                self.device,
-                work,
-                image,
-                planes,
-                *size,
-                self.config.dssim_weight,
-                self.turn,
-                kept=inputs.kept,
-                blended=frame.blended,
-                terms=terms,
-            )
+            return loss(self.device, work, image, planes, size, weight, self.turn, kept=inputs.kept, further=further)
 
         keys = tuple(term.key for term in terms)
         if None in keys:
@@ -328,9 +319,7 @@ class GradientStep:
             project_grad(
                 rows.device,
                 rows.parameters,
-                rows.camera_array,
-                rows.projected,
-                rows.slots,
+                rows.view,
                 rows.gradients,
                 rows.screen,
                 sh_rest=self.adam_step.updates_sh_rest,
@@ -381,8 +370,8 @@ class GradientStep:
             models = (parameters, rows.gradients, first, second)
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
-            view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            project_step(rows.device, step, rows.model, *view, explore=self.explore, region=self.region)
+            target = (rows.model, rows.view, rows.screen, readback)
+            project_step(rows.device, step, *target, explore=self.explore, region=self.region)
         noise(self.device, self.explore, rows.parameters, rows.start, readback, self.region)
 
 

@@ -16,7 +16,7 @@ from clsplat.stages.adam import AdamStep
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
 from clsplat.stages.loss_terms import DepthTerm
-from clsplat.stages.project import Projected, Screen, Slots
+from clsplat.stages.project import Projected, Screen, Slots, ViewSlots
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +125,11 @@ class StepRows(ViewRows):
     def parameters(self) -> DeviceGaussians:
         """Parameters of these rows: the first element of `model`."""
         return self.model[0]
+
+    @property
+    def view(self) -> ViewSlots:
+        """The rows' projection and slots, for the gradient of projection."""
+        return ViewSlots(self.camera_array, self.projected, self.slots)
 
 
 class ViewPart:

@@ -18,12 +18,12 @@ CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
 """Number of clusters whose views alternate. With one cluster after the other, successive views would have more in
-common, but the scene bonsai loses 0.3 dB: the model fits the last cluster at the expense of the other clusters
+common. But the scene bonsai then loses 0.3 dB: the model fits the last cluster at the expense of the others
 (docs/decisions/0050)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
 
-A length unit is 1.4 times the median depth of what photographs look at, or less. With about this distance the views of
+A length unit is 1.4 times the median depth of the photographs, or less. With about this distance the views of
 a cluster have the most Gaussians in common (docs/decisions/0050).
 """
 POINT_STEP = 2.0**-16

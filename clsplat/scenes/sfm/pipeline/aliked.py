@@ -2,11 +2,11 @@
 """ALIKED features of photographs by an ONNX network, with onnxruntime, and their matching.
 
 pycolmap's wheels are built without ONNX, so clsplat runs the network and writes the features and matches into COLMAP's
-database itself. The network is as the COLMAP project publishes it:
+database itself. The network is as the COLMAP project publishes it.
 
-- inputs: `image` (1, 3, H, W), RGB from 0 to 1, H and W multiples of 32; `max_keypoints`, int64; `min_score`, float32
-- outputs: `keypoints` (1, K, 2), from -1 to 1 between the centres of the outermost pixels; `descriptors` (1, K, D);
-  `scores` (1, K)
+Inputs: `image` (1, 3, H, W), RGB from 0 to 1, H and W multiples of 32; `max_keypoints`, int64; `min_score`, float32.
+Outputs: `keypoints` (1, K, 2), from -1 to 1 between the centres of the outermost pixels; `descriptors` (1, K, D);
+  `scores` (1, K).
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ def verified_matches(database: Path) -> dict[tuple[int, int], NDArray[np.uint32]
 
 
 def cameras_without_focal_length(database: Path) -> list[pycolmap.Camera]:
-    """Return the pinhole cameras, with or without distortion, of which EXIF gives no focal length."""
+    """Return the pinhole cameras, with or without distortion, for which EXIF gives no focal length."""
     with pycolmap.Database.open(database) as opened:
         cameras = opened.read_all_cameras()
     return [camera for camera in cameras if camera.is_perspective_pinhole() and not camera.has_prior_focal_length]
@@ -250,8 +250,8 @@ def weight_gps(database: Path) -> None:
 def feature_evidence(database: Path) -> dict[str, Any]:
     """Return counts of features and matches, for the message about a failed reconstruction.
 
-    Keys: "features" is the median number in a photograph, "pairs" the number of pairs that were tried, "matched" the
-    number of pairs with verified matches, and "matches" the largest number of verified matches of a pair.
+    Keys: "features" is the median number in a photograph, and "pairs" the number of pairs that were tried. "matched" is
+    the number of pairs with verified matches, and "matches" the largest number of these in a pair.
     """
     with contextlib.closing(sqlite3.connect(database)) as connection:
         features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
