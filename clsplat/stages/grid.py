@@ -58,16 +58,16 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 
 @stage("appearance")
 def apply_grid(
-    device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
+    device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, size: tuple[int, int]
 ) -> DeviceArray:
     """Apply the colour transforms of a photograph's grid to `image`, and return the new planes (3, rows, stride).
 
     photograph: the photograph's index in `grids`.
-    width, height: size of the image in pixels, without padding.
+    size: width and height of the image in pixels, without padding.
     """
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
-    sizes = (photograph, stride, rows * stride, *_spans(width, height))
+    sizes = (photograph, stride, rows * stride, *_spans(*size))
     kernel = device.kernels("grid", {"LANES": 1}).slice
     launch_grid(device, kernel, (stride, rows), *sizes, grids.grids, image, seen)
     return seen
@@ -81,8 +81,7 @@ def grid_gradient(
     photograph: int,
     image: DeviceArray,
     gradient: DeviceArray,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     weight: float,
     place: int = 0,
 ) -> DeviceArray:
@@ -94,7 +93,7 @@ def grid_gradient(
     gradient with respect to `image`, the image before the transform.
     place: index of the view in the batch; the result of each view is in an array of its own.
     """
-    _, rows, stride = image.shape
+    (width, height), (_, rows, stride) = size, image.shape
     plane, (across, down) = rows * stride, _spans(width, height)
     lines = work.array("appearance_lines", (height, GRID_SHAPE[2], 12, GRID_SHAPE[0]))
     by_grid = work.array(f"appearance_by_grid_{place}", GRID_SHAPE)

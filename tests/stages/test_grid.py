@@ -30,7 +30,7 @@ def test_a_grid_of_identities_changes_nothing(shaped_device: Device) -> None:
     image = np.random.default_rng(3).random((20, 30, 3)).astype(np.float32)
     work = Workspace(shaped_device)
     grids = Grids.on(shaped_device, reference.identity(GRID_SHAPE[:3])[None].astype(np.float32))
-    seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, planes_of(image, np.nan)), 30, 20)
+    seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, planes_of(image, np.nan)), (30, 20))
     assert_close(seen.get()[:, :20, :30].transpose(1, 2, 0), image, relative=3e-7)
 
 
@@ -39,7 +39,7 @@ def test_the_variations_gradient_alone(shaped_device: Device) -> None:
     work, grids = Workspace(shaped_device), Grids.on(shaped_device, values)
     planes = upload(shaped_device, planes_of(np.full((8, 8, 3), 0.4, np.float32), np.nan))
     none = upload(shaped_device, planes_of(np.zeros((8, 8, 3), np.float32), np.nan))
-    by_grid = grid_gradient(shaped_device, work, grids, 1, planes, none, 8, 8, 10.0)
+    by_grid = grid_gradient(shaped_device, work, grids, 1, planes, none, (8, 8), 10.0)
     assert_close_gradient(by_grid.get(), 10 * reference.variation_gradient(values[1].astype(np.float64)), 1e-6)
 
 

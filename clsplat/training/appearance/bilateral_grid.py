@@ -68,11 +68,11 @@ class ViewGrid(ViewPart):
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
         """Return the render `image`, of width and height `size`, with the colour changes of the photograph's grid. The
         photograph `target` is not changed."""
-        return apply_grid(self.device, work, self.grids, self.view, image, *size)
+        return apply_grid(self.device, work, self.grids, self.view, image, size)
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
-    ) -> DeviceArray | None:
+    ) -> DeviceArray:
         """Return the loss's gradient with respect to the grid.
 
         image: the render before `compare`. size: its width and height.
@@ -81,7 +81,7 @@ class ViewGrid(ViewPart):
         At the grid's first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
         of_view = (self.grids, self.view, image, gradient)
-        by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
+        by_grid = grid_gradient(self.device, work, *of_view, size, VARIATION_WEIGHT, self.place)
         if self.visit == 1:
             with only_tried(self.device):
                 replace(self, ends=True).update(by_grid, by_grid)
