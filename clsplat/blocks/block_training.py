@@ -8,7 +8,7 @@ training has finished.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files.atomic import atomic_write, remove
 from clsplat.gaussians import Gaussians
+from clsplat.runs.appearance import check_appearance
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run, is_run, owned_files
 from clsplat.scenes.dataset import SceneFrame
@@ -96,15 +97,26 @@ def finish(city: Path, steps: int | None, load: LoadScene, train: TrainRun, devi
         coarse = Run.open(city / COARSE_FOLDER)
         scene = load(plan.settings, plan.scene, coarse.frame_to_resume())
         check_plan(city, scene)
+        start = _start_of_finish(city, plan, [view.name for view in scene.train_views])
         remove(city / DONE_FILE)  # of fewer steps: if it stayed, an interrupted training would count as finished
         run = Run.create(city, config, scene=plan.scene, resume=is_run(city), beside=CITY_FILES)
         run.resume_command = shlex.join(["clsplat", "blocks", "finish", str(city)])
-        learnt = city / MERGED_APPEARANCE_FOLDER if plan.settings.appearance != "none" else None
-        start = Start(Gaussians.load(city / MERGED_FILE), None, learnt)
         train(scene_of_finish(scene, plan, coarse), run, start)
         _copy_refined(coarse, run)
         keep_done(run, plan.digest, merged)
     return True
+
+
+def _start_of_finish(city: Path, plan: BlockPlan, photographs: Sequence[str]) -> Start:
+    """Read the merged model and check the merged appearance. Raises InputError that says how to merge again."""
+    folder, kind = city / MERGED_APPEARANCE_FOLDER, plan.settings.appearance
+    try:
+        model = Gaussians.load(city / MERGED_FILE)
+        if kind != "none":
+            check_appearance(folder, kind, photographs)
+    except InputError as error:
+        raise InputError(f"{error}; remove the file, and run clsplat blocks merge {city}") from None
+    return Start(model, None, folder if kind != "none" else None)
 
 
 def is_trained(city: Path, plan: BlockPlan, block: Block) -> bool:
@@ -136,12 +148,12 @@ def _merged(city: Path, plan: BlockPlan) -> str:
     """Return the digest of the merge. Raises InputError unless it has the models and the appearances of all blocks."""
     wanted, path = merge_digest(city, plan), city / MERGED_FILE
     if not is_merged(city, plan):
-        if not path.exists():
-            what = f"{path}: is missing"
-        elif (found := merged_of(path)) != wanted:
-            what = f"{path}: is a merge of other models ({str(found)[:12]})"
-        else:
-            what = f"{city / MERGED_APPEARANCE_FOLDER}: lacks the merged appearance"
+        what = f"{path}: is missing" if not path.exists() else f"{path}: is no merge of blocks"
+        with suppress(InputError):
+            if (found := merged_of(path)) == wanted:
+                what = f"{city / MERGED_APPEARANCE_FOLDER}: lacks the merged appearance"
+            elif found is not None:
+                what = f"{path}: is a merge of other models ({found[:12]})"
         raise InputError(f"{what}, expected the merge of all blocks; run clsplat blocks merge {city}")
     return wanted
 

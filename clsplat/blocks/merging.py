@@ -35,7 +35,7 @@ from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.runs.run import Run
 
 MERGED_COMMENT = "clsplat merged"
-"""Beginning of the comment in merged.ply that is followed by the digest of the plan and of the blocks' models."""
+"""Beginning of the comment in merged.ply that is followed by the digest of the plan and of the blocks' results."""
 
 
 @dataclass(frozen=True)

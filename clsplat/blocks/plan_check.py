@@ -58,6 +58,11 @@ def check_plan(
             f"{coarse.model_path}: is not the coarse model that {path} was made with, expected this model; remove the "
             f"plan and the folder {city / COARSE_FOLDER}, and run clsplat blocks plan again"
         )
+    if missing := _missing_results(coarse):
+        raise InputError(
+            f"{missing[0]}: no such file, expected the result of the coarse model; remove {path}, and run clsplat "
+            "blocks plan again, which makes the same plan"
+        )
     if changed := scene_differences(coarse, scene, plan.settings, photographs):
         raise InputError(
             f"{path}: was made for another scene than {scene.source or plan.scene} is now: {'; '.join(changed)}; "
@@ -128,7 +133,7 @@ def check_coarse(coarse: Run, wanted: TrainConfig, scene: Scene, config: TrainCo
             f"{coarse.config_path}: has other settings: {examples(changed)}; expected the same, or a new folder for a "
             "new plan"
         )
-    finished = _has_results(coarse) and coarse.model_record().get("step") == coarse.config.iterations
+    finished = not _missing_results(coarse) and coarse.model_record().get("step") == coarse.config.iterations
     if finished and (changed := scene_differences(coarse, scene, config)):
         raise InputError(
             f"{coarse.path}: was trained on another scene than {scene.source or scene.name} is now: "
@@ -137,12 +142,12 @@ def check_coarse(coarse: Run, wanted: TrainConfig, scene: Scene, config: TrainCo
     return finished
 
 
-def _has_results(coarse: Run) -> bool:
-    """True if a run has all files that the blocks read, of which a stopped training may have written only some."""
+def _missing_results(coarse: Run) -> list[Path]:
+    """Files that the blocks read of a run, and that are not there: a stopped training may have written only some."""
     wanted = coarse.result_files
     if coarse.config.refines:
         wanted += [coarse.refined_path / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
-    return all(path.exists() for path in wanted)
+    return [path for path in wanted if not path.exists()]
 
 
 def settings_differences(planned: TrainConfig, now: TrainConfig, where: str = "in the plan") -> list[str]:

@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, PLAN_FILE
 from clsplat.errors import InputError
@@ -28,6 +29,8 @@ CITY_FILES = frozenset(
     }
 )
 """Names of files and folders in a city's folder, beside those of the run that is the finish."""
+RECORD_FORM = 2
+"""Number of the form of these records. In form 1, blocks did not train their appearances."""
 _EXPECTED_RECORD = "a record that clsplat blocks wrote"
 
 
@@ -60,9 +63,10 @@ def check_begun(run: Path, plan: str, start: str, advice: Callable[[], str]) -> 
     path = run / BEGUN_FILE
     if not path.exists():
         run.mkdir(parents=True, exist_ok=True)
-        atomic_write(path, (json.dumps({"clsplat_block": 1, "plan": plan, "start": start}) + "\n").encode())
+        content = {"clsplat_block": RECORD_FORM, "plan": plan, "start": start}
+        atomic_write(path, (json.dumps(content) + "\n").encode())
         return
-    record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
+    record = _loaded(path)
     for name, now, what in (("plan", plan, "by another plan"), ("start", start, "with another model")):
         if record.get(name) != now:
             raise InputError(
@@ -73,7 +77,7 @@ def check_begun(run: Path, plan: str, start: str, advice: Callable[[], str]) -> 
 def keep_done(run: Run, plan: str, start: str) -> None:
     """Write done.json for a finished training. plan, start: as for `DoneRecord`."""
     record = DoneRecord(plan, start, {file.name: digest(file) for file in run.result_files})
-    atomic_write(run.path / DONE_FILE, (json.dumps({"clsplat_block": 1, **asdict(record)}) + "\n").encode())
+    atomic_write(run.path / DONE_FILE, (json.dumps({"clsplat_block": RECORD_FORM, **asdict(record)}) + "\n").encode())
 
 
 def done_record(run: Path) -> DoneRecord | None:
@@ -84,7 +88,7 @@ def done_record(run: Path) -> DoneRecord | None:
     path = run / DONE_FILE
     if not path.exists():
         return None
-    record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
+    record = _loaded(path)
     files = record.get("files")
     digests = files if isinstance(files, dict) else {}
     texts = [record.get("plan"), record.get("start"), digests.get("model.ply"), *digests.values()]
@@ -93,6 +97,17 @@ def done_record(run: Path) -> DoneRecord | None:
     if not all((run / name).exists() for name in digests):
         return None
     return DoneRecord(str(record["plan"]), str(record["start"]), digests)
+
+
+def _loaded(path: Path) -> dict[str, Any]:
+    """Return the content of a record. Raises InputError for a file that is no record, or of another form."""
+    record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
+    if (form := record.get("clsplat_block")) != RECORD_FORM:
+        raise InputError(
+            f"{path}: clsplat_block is {form!r:.40}, expected {RECORD_FORM}: another version of clsplat began this "
+            f"training; finish with that version, or move {path.parent} away to train anew"
+        )
+    return record
 
 
 def is_done(run: Path, plan: str, start: str | None = None) -> bool:

@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from clsplat.arrays import Float32, Float64
-from clsplat.config.colour_models import ColourModel
+from clsplat.config.colour_models import COLOUR_MODELS, ColourModel
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import parse_json, read_document
 from clsplat.images.alpha import Image
@@ -138,6 +138,17 @@ def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...] | None =
         return np.ascontiguousarray(grids[rows])
     except (ValueError, TypeError, KeyError, IndexError, OSError, BadZipFile, OverflowError) as error:
         raise _misread(arrays, error) from None
+
+
+def check_appearance(folder: Path, kind: str, names: Sequence[str]) -> None:
+    """Raise InputError unless the files in `folder` have a readable appearance of these photographs.
+
+    kind: the setting `appearance` of the run that wrote the files. names: the photographs' names.
+    """
+    if kind in COLOUR_MODELS:
+        entries_of(folder, names, COLOUR_MODELS[kind])
+    else:
+        grids_of(folder, names)
 
 
 def learnt_of(folder: Path, kind: str, names: Sequence[str] = ()) -> dict[str, Any]:

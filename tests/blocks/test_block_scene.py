@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from small_city import FINISH_STEPS, WHOLE, load, trains_on, write_city
 
 from clsplat.blocks.block_training import finish, train_block
 from clsplat.blocks.merging import merge
+from clsplat.blocks.plan import SKY_BLOCK, Rectangle, Sky, read_plan, write_plan
+from clsplat.blocks.progress_records import keep_done
 from clsplat.device.context import Device
 from clsplat.runs.refined_lenses import through_refined
 from clsplat.runs.run import Run
@@ -46,6 +49,9 @@ def refined(tmp_path_factory: pytest.TempPathFactory, small_scene: Path, default
     assert merge(city)
     assert finish(city, None, load(), trains_on(default_device))
     return city
+
+
+EVERYWHERE = Rectangle((-inf, -inf), (inf, inf))
 
 
 def gains(run: Path) -> dict[str, object]:
@@ -110,9 +116,8 @@ def test_a_city_without_the_learnt_appearance_is_refused(refined: Path, tmp_path
     (city / "coarse" / "appearance.json").unlink()
     (city / "blocks" / "0_0" / "done.json").unlink()
     said = refusal(lambda: train_block(city, "0,0", load(), trains_on(default_device)))
-    assert (
-        "coarse/appearance.json: no such file, expected a finished run of clsplat train --appearance exposure" in said
-    )
+    assert "coarse/appearance.json: no such file, expected the result of the coarse model; remove" in said
+    assert "plan.json, and run clsplat blocks plan again" in said
 
 
 def test_the_merged_appearance_is_the_mean_of_the_blocks(refined: Path) -> None:
@@ -120,10 +125,33 @@ def test_the_merged_appearance_is_the_mean_of_the_blocks(refined: Path) -> None:
     blocks = [gains(refined / "blocks" / name) for name in ("0_0", "1_0")]
     assert merged.keys() == coarse.keys()
     assert any(name in blocks[0] and name in blocks[1] for name in merged)
+    held_out = json.loads((refined / "appearance.json").read_text())["held_out"]
+    mean = np.mean([row["log2_gains"] for row in merged.values()], axis=0)  # type: ignore[index]
+    assert np.abs(mean).max() > 1e-4
+    for row in held_out.values():
+        np.testing.assert_allclose(row["log2_gains"], mean, rtol=1e-12)  # a sum of ten doubles
     for name, row in merged.items():
         found = [block[name]["log2_gains"] for block in blocks if name in block]  # type: ignore[index]
         wanted = np.mean(found, axis=0).tolist() if found else coarse[name]["log2_gains"]  # type: ignore[index]
         assert row == {"log2_gains": wanted}
+
+
+def test_the_skys_gains_are_not_merged(refined: Path, tmp_path: Path) -> None:
+    city = shutil.copytree(refined, tmp_path / "city")
+    plan, folder = read_plan(city), city / "blocks" / "sky"
+    shutil.copytree(city / "blocks" / "1_0", folder)
+    record = json.loads((folder / "appearance.json").read_text())
+    for row in record["photographs"].values():
+        row["log2_gains"] = [5.0, 5.0, 5.0]
+    (folder / "appearance.json").write_text(json.dumps(record))
+    sky = replace(plan.blocks[1], name=SKY_BLOCK, cell=EVERYWHERE, widened=EVERYWHERE)
+    plan = replace(plan, sky=Sky((0.0, 0.0, 0.0), 100.0), blocks=(*plan.blocks, sky))
+    write_plan(city, plan)
+    for block in plan.blocks:
+        keep_done(Run.open(city / "blocks" / block.name), plan.digest, plan.coarse)
+    before = gains(city / "merged")
+    assert merge(city)
+    assert gains(city / "merged") == before
 
 
 def test_a_block_without_its_appearance_is_trained_again(refined: Path, tmp_path: Path, default_device: Device) -> None:
@@ -155,6 +183,10 @@ def test_the_merged_appearance_is_missing_or_a_blocks_has_changed(
     )
     assert merge(city)
     assert merged.read_bytes() == content
+    merged.write_text("{")
+    said = refusal(lambda: finish(city, FINISH_STEPS + 1, load(), trains_on(default_device)))
+    assert f"remove the file, and run clsplat blocks merge {city}" in said
+    assert (city / "done.json").exists()
     merged.unlink()
     block.write_bytes(block.read_bytes().replace(b"0.", b"1.", 1))
     assert "1_0/appearance.json: is not the file that the block's training wrote; put it back" in refusal(

@@ -211,7 +211,7 @@ def test_changed_models_are_refused(done_city: Path, tmp_path: Path, default_dev
         lambda: finish(city, None, load(), trains_on(default_device))
     )
     shutil.copy(model, city / "merged.ply")
-    assert "merged.ply: is a merge of other models" in refusal(
+    assert "merged.ply: is no merge of blocks, expected the merge of all blocks" in refusal(
         lambda: finish(city, None, load(), trains_on(default_device))
     )
     coarse = city / "coarse" / "model.ply"
@@ -230,10 +230,17 @@ def test_a_run_of_another_plan_is_refused(done_city: Path, tmp_path: Path, defau
     assert "blocks/0_0: its training began by another plan" in refusal(
         lambda: train_block(city, "0,0", load(), trains_on(default_device))
     )
-    (city / "blocks" / "0_0" / "done.json").write_text("[]")
-    assert "done.json: is not a JSON object" in refusal(
-        lambda: train_block(city, "0,0", load(), trains_on(default_device))
-    )
+    done = city / "blocks" / "0_0" / "done.json"
+    for content, said in (
+        ("[]", "done.json: is not a JSON object"),
+        (
+            '{"clsplat_block": 1, "model": "ab"}',
+            "clsplat_block is 1, expected 2: another version of clsplat began this training",
+        ),
+        ('{"clsplat_block": 2, "plan": "ab", "start": "cd", "files": {}}', "done.json: is damaged, expected a record"),
+    ):
+        done.write_text(content)
+        assert said in refusal(lambda: train_block(city, "0,0", load(), trains_on(default_device)))
 
 
 def test_a_missing_photograph_is_named(

@@ -20,7 +20,7 @@ KNOWN = {"whole": NAMES, "one": ("b", "a"), "other": ("c", "b", "elsewhere")}
 
 def write_colours(folder: Path, kind: str, first: float) -> Path:
     """Write an appearance.json. Gains are `first` plus 1 for each later photograph."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     rows: dict[str, dict[str, list[float]]] = {}
     for place, name in enumerate(KNOWN[folder.name]):
         rows[name] = {"log2_gains": [first + place, 0.5, -1.0]}
@@ -75,5 +75,11 @@ def test_a_damaged_part_is_named(tmp_path: Path) -> None:
     assert f"{path}: is of --appearance grid, expected --appearance exposure" in said({"kind": "grid"})
     rows = {"a": {"log2_gains": [0.0, 1.0]}}
     assert f"{path}: ValueError: expected 3 numbers a photograph" in said({"kind": "exposure", "photographs": rows})
+    coarse = whole / "appearance.json"
+    content = json.loads(coarse.read_text())
+    content["photographs"]["d"] = 5
+    coarse.write_text(json.dumps(content))
+    assert f"{coarse}: TypeError" in refusal(lambda: mean_appearance(whole, [], "exposure"))
+    whole = write_colours(tmp_path / "again" / "whole", "exposure", 0)
     path.unlink()
     assert f"{path}: no such file" in refusal(lambda: mean_appearance(whole, [one], "exposure"))

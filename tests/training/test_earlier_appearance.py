@@ -17,6 +17,7 @@ from tiny import short
 from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
+from clsplat.optimisation.trained_region import TrainedRegion
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.training.loop import StepReport
@@ -132,6 +133,20 @@ def test_the_mean_of_some_photographs_stays(earlier: Run, scene: Scene, default_
     assert np.abs(before.mean(axis=0)).max() > 0.4
     # roundings of float32 numbers below 2
     np.testing.assert_allclose(now.mean(axis=0), before.mean(axis=0), rtol=0, atol=4e-7)
+
+
+def test_vignettes_stay_in_a_region(scene: Scene, default_device: Device, earlier: Run) -> None:
+    """Gains and mixes of its photographs move."""
+    everywhere = TrainedRegion(np.eye(3)[:2], np.full(2, -np.inf), np.full(2, np.inf))
+    for region in (everywhere, None):
+        trainer = Trainer(scene, earlier.config, default_device, Start(earlier.model, region, earlier.path))
+        before = photographs(trainer.appearance.record() or {})
+        for _ in range(4):
+            trainer.train_step()
+        now = photographs(trainer.appearance.record() or {})
+        moved = {part for name, row in now.items() for part in row if row[part] != before[name][part]}  # type: ignore[index, attr-defined]
+        kept = {"centre", "grid"} | ({"vignette"} if region is not None else set())
+        assert moved == {part for row in now.values() for part in row} - kept  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("batch", [1, 2])

@@ -42,10 +42,11 @@ class Appearance(Component):
             return inputs
         return [replace(each, parts=(*each.parts, share)) for each, share in zip(inputs, shares, strict=True)]
 
-    def begin_from(self, folder: Path) -> None:
+    def begin_from(self, folder: Path, *, keeps_lenses: bool) -> None:
         """Begin with the appearance that the files in `folder` have for the photographs of the same names. Its mean
         over these photographs stays.
 
+        keeps_lenses: True if the lenses' part of the appearance is not trained.
         Raises InputError if the files do not have this appearance of all training photographs.
         """
 

@@ -41,7 +41,7 @@ class ViewGrid(ViewPart):
     grids, view: the grids of all photographs with their moments, and the row of this view's grid.
     visit: number of steps that have shown this view, including this step.
     rate: learning rate of the grid in this step.
-    ends: True if a pass through all training views ends with this view.
+    ends: True if a pass through all training views, or the training, ends with this view.
     place: the view's position in the batch.
     """
 
@@ -110,11 +110,13 @@ class GridsOfAll(Appearance):
         start = np.broadcast_to(np.eye(3, 4, dtype=np.float32), (self._count, *GRID_SHAPE))
         self._grids = Grids.on(device, np.ascontiguousarray(start))
 
-    def begin_from(self, folder: Path) -> None:
+    def begin_from(self, folder: Path, *, keeps_lenses: bool) -> None:
         """Begin with the grids that the files in `folder` have for the photographs of the same names. Their mean stays.
 
+        keeps_lenses: not used, as lenses have no grids.
         Raises InputError if the files do not have grids of this size for all training photographs.
         """
+        del keeps_lenses
         names = [view.name for view in self._scene.train_views]
         self._grids = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE))
 
@@ -140,7 +142,7 @@ class GridsOfAll(Appearance):
                 view,
                 (number - 1) // count + 1,
                 rate_at(self._config, number, count, ends=GRID_RATE_END_FRACTION, hastens=False),
-                number % count == 0,
+                number % count == 0 or number == self._config.iterations,
                 place,
             )
             for place, (view, number) in enumerate(zip(views, numbers, strict=True))

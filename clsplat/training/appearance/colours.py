@@ -204,16 +204,18 @@ class ColoursOfAll(Appearance):
         self._lenses = Gains.on(device, np.zeros(shape, np.float32)) if self._model.of_lens else None
         self._earlier: NDArray[np.float32] | None = None
         self._mean = np.zeros(self._model.entries)
+        self._keeps_lenses = False
 
-    def begin_from(self, folder: Path) -> None:
+    def begin_from(self, folder: Path, *, keeps_lenses: bool) -> None:
         """Begin with the entries that appearance.json in `folder` has for the photographs of the same names, and with
         the mean of a lens's photographs. The mean of the photographs' entries stays.
 
+        keeps_lenses: True if the lenses' entries are not trained.
         Raises InputError if the file does not have this colour model of all training photographs.
         """
         views, model = self._scene.train_views, self._model
         own, of_lenses = entries_of(folder, [view.name for view in views], model)
-        self._earlier, self._mean = own.astype(np.float32), own.mean(axis=0)
+        self._earlier, self._mean, self._keeps_lenses = own.astype(np.float32), own.mean(axis=0), keeps_lenses
         if self._lenses is not None:
             lenses = np.array([taken.lens for taken in self._taken])
             values = np.zeros((len(self._lens_rows), model.lens_entries))
@@ -272,7 +274,9 @@ class ColoursOfAll(Appearance):
                 self._taken[view],
                 number,
                 rate_at(self._config, number, len(self._taken), ends=GAIN_RATE_END_FRACTION),
-                rate_at(self._config, number, len(self._lens_rows), ends=GAIN_RATE_END_FRACTION),
+                0.0
+                if self._keeps_lenses
+                else rate_at(self._config, number, len(self._lens_rows), ends=GAIN_RATE_END_FRACTION),
                 place,
             )
             for place, (view, number) in enumerate(zip(views, numbers, strict=True))
