@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import CAMERA_MODELS, Camera
@@ -475,6 +474,8 @@ def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
     Alpha is straight in input and output. Pixels outside the picture repeat its border. `Lens.pinhole` has no such
     pixels, except for extreme fisheyes.
     """
+    from scipy import ndimage  # imported here, as the import takes 0.1 s and few commands need it
+
     natural = lens.pinhole(camera.rotation, camera.translation)
     shrinks = camera.width < 0.75 * natural.width
     grid = camera.resized(natural.width, natural.height) if shrinks else camera
