@@ -32,7 +32,6 @@ from clsplat.scenes.geography.georeference import Georeference
 with undisturbed():
     import pycolmap
 
-
 MAX_IMAGE_SIDE_PX = 1 << 20
 """Maximum width or height in pixels. Larger values indicate a damaged file, and width times height could overflow."""
 MAX_COORDINATE = 1e30
