@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import tyro
-from tyro.conf import subcommand
+from tyro.conf import HelptextFromCommentsOff, subcommand
 
 from clsplat.cli.flags import grouped_help, near, unknown_flags
 from clsplat.cli.options import Verb
@@ -117,8 +117,6 @@ def parse(arguments: Sequence[str]) -> Verb:
             raise SystemExit(0)
         report(f"{arguments[0]} is not complete, expected one of {', '.join(family)}", 2, arguments)
         raise SystemExit(2)
-    kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}
-    commands: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
     boxes = io.StringIO()
     helping = not {"-h", "--help"}.isdisjoint(arguments)
     called = verb_class(arguments[0]) if arguments and arguments[0] in VERBS else None
@@ -127,7 +125,7 @@ def parse(arguments: Sequence[str]) -> Verb:
         raise SystemExit(0)
     try:
         with _text_rules(), contextlib.redirect_stderr(boxes), contextlib.nullcontext() if helping else _wide():
-            verb: Verb = tyro.cli(commands, args=list(arguments), prog="clsplat", description=PROGRAM_DESCRIPTION)
+            verb = _parsed(arguments, called)
     except SystemExit as error:
         if error.code == 2:
             report(_trouble(arguments, called, _unboxed(boxes.getvalue())), 2, arguments)
@@ -136,6 +134,24 @@ def parse(arguments: Sequence[str]) -> Verb:
         raise
     flags = [word.partition("=")[0][2:].replace("-", "_") for word in arguments if word.startswith("--")]
     return verb.completed({*flags, *(re.sub(r"(^|\.)no_", r"\1", flag) for flag in flags)})
+
+
+def _parsed(arguments: Sequence[str], called: type[Verb] | None) -> Verb:
+    """Let tyro parse a command line. Raises SystemExit after printing an error or the help.
+
+    called: dataclass of the verb that `arguments` begin with; None if they begin with something else.
+    """
+    # Docstrings of fields are the help. tyro would also look for comments, and tokenize the classes' sources for that.
+    config = (HelptextFromCommentsOff,)
+    completing = any(word.replace("_", "-").startswith("--tyro-") for word in arguments)  # of all verbs, or none
+    verb: Verb
+    if called is not None and not completing:  # without the other verbs, which take tyro 10 ms
+        verb = tyro.cli(called, args=arguments[1:], prog=f"clsplat {arguments[0]}", config=config)
+    else:
+        kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}
+        commands: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
+        verb = tyro.cli(commands, args=arguments, prog="clsplat", description=PROGRAM_DESCRIPTION, config=config)
+    return verb
 
 
 _TYRO_UNION_ERROR = re.compile(

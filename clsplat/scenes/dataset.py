@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import CAMERA_MODELS, Camera
@@ -32,7 +31,6 @@ from clsplat.scenes.geography.georeference import Georeference
 # stack trace. `undisturbed` prevents both.
 with undisturbed():
     import pycolmap
-
 
 MAX_IMAGE_SIDE_PX = 1 << 20
 """Maximum width or height in pixels. Larger values indicate a damaged file, and width times height could overflow."""
@@ -475,6 +473,8 @@ def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
     Alpha is straight in input and output. Pixels outside the picture repeat its border. `Lens.pinhole` has no such
     pixels, except for extreme fisheyes.
     """
+    from scipy import ndimage  # imported here, as the import takes 0.1 s and few commands need it
+
     natural = lens.pinhole(camera.rotation, camera.translation)
     shrinks = camera.width < 0.75 * natural.width
     grid = camera.resized(natural.width, natural.height) if shrinks else camera

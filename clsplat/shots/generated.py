@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
@@ -162,6 +161,8 @@ def through(cameras: Sequence[Camera], frames: int, up: Float64 | None = None) -
     results. Speed combines distance and angle, each relative to its median step, so that a camera that only turns also
     takes time. Raises ValueError for no cameras or no frames.
     """
+    from scipy.spatial.transform import Rotation  # here, as the import takes 0.1 s and few commands need it
+
     _check("through", cameras, frames)
     smooth = _smoothed(cameras)
     positions = np.stack([camera.position for camera in smooth])
@@ -183,6 +184,8 @@ def _in_medians(lengths: Float64, rounding: float) -> Float64:
 
 
 def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
+    from scipy.spatial.transform import Rotation  # as above
+
     positions = np.stack([camera.position for camera in cameras])
     rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in cameras]))
     smooth = []

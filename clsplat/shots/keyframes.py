@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 MAX_TANGENT_SLOPE_RATIO = 3.0
 """Largest ratio of a tangent to the slope of an adjacent segment. At 3, a cubic's inner Bezier points are one chord
@@ -44,6 +46,9 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
 
     Raises ValueError if there are no keys, if they are not in order, or if they span `loop` frames or more.
     """
+    from scipy.interpolate import PchipInterpolator  # here, as the import takes 0.3 s and few commands need it
+    from scipy.spatial.transform import Rotation
+
     if not keys:
         raise ValueError("expected at least one key")
     times = np.array([key.frame for key in keys], np.float64)
@@ -146,6 +151,8 @@ def _positions(times: Float64, keys: Float64, at: Float64, segment: NDArray[np.i
 
 
 def _rotations(times: Float64, keys: Rotation, at: Float64, segment: NDArray[np.intp]) -> Rotation:
+    from scipy.spatial.transform import Rotation  # as above
+
     lengths = np.diff(times)
     # the rotation vector from one key to the next is the same in the axes of both keys
     steps = (keys[:-1].inv() * keys[1:]).as_rotvec()

@@ -62,10 +62,10 @@ def test_a_command_line_is_parsed_once(line: str, tmp_path: Path, monkeypatch: p
     run = tmp_path / "run"
     Run.create(run, TrainConfig(seed=5), scene=tmp_path)
     calls: list[Any] = []
-    noted(monkeypatch, tyro, "cli", lambda _, **options: calls.append(options["args"]))
+    noted(monkeypatch, tyro, "cli", lambda _, **options: calls.append([options["prog"], *options["args"]]))
     words = [word.replace("RUN", str(run)) for word in line.replace(" --overwrite", "").split()]
     assert parse(words).json  # type: ignore[attr-defined]
-    assert calls == [words]
+    assert calls == [[f"clsplat {words[0]}", *words[1:]]]
 
 
 @pytest.mark.parametrize("flag", [each.name for each in fields(TrainVerb) if each.type == "Flag"])

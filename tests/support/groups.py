@@ -4,7 +4,7 @@
 Tests for the same driver in the same shape are a group, so that its kernels are built only once, which takes most of
 the time; each shape has builds of its own. Tests that name no shape have the driver's own. Shapes with and without a
 Gaussian per work-item share all kernels but one, and are a group. Other tests of a file are a group, because they share
-fixtures.
+fixtures; those of the files that draw the demo's still life are one group, so that its textures are made only once.
 Groups follow from the tests' identifiers. The marker of pytest-xdist 3.8 has no effect with pytest 9.2.
 """
 
@@ -18,6 +18,14 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
+STILL_LIFE = {
+    *("test_capture", "test_capture_sources", "test_coming_from", "test_demo_scene"),
+    *("test_sfm", "test_sfm_camera_files", "test_sfm_copies", "test_sfm_upright", "test_sfm_weights"),
+    *("test_video_colours", "test_video_frames", "test_video_sfm"),
+}
+"""Files whose tests draw the demo's still life (`demo_photographs`, `walk_videos`). Its textures take each process 3.5
+seconds of processor time."""
+
 
 def group_of(identifier: str, drivers: Mapping[int, str], own: Mapping[int, str]) -> str:
     """The group of a test.
@@ -29,7 +37,7 @@ def group_of(identifier: str, drivers: Mapping[int, str], own: Mapping[int, str]
     parameters = rest.partition("[")[2]
     named = [index for index, words in drivers.items() if words in parameters]
     if not named:
-        return PurePath(file).stem
+        return "still life" if PurePath(file).stem in STILL_LIFE else PurePath(file).stem
     driver, shape = max(named, key=lambda index: len(drivers[index])), re.match(r"\d+x\d+(?=g?-)", parameters)
     return f"driver {driver} in {shape[0]}" if shape and shape[0] != own.get(driver) else f"driver {driver}"
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from importlib.machinery import SourceFileLoader
@@ -14,7 +15,7 @@ from typing import Any
 
 import pytest
 from calls import python
-from groups import begin_apart, group_of, in_one_order
+from groups import STILL_LIFE, begin_apart, group_of, in_one_order
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = """
@@ -145,6 +146,8 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
         ("tests/stages/test_sort.py::test_it", "test_sort"),
         ("tests/stages/test_sort.py::test_it[64-cloud]", "test_sort"),
         ("tests/stages/test_fast-1.0.py::test_it[64]", "test_fast-1.0"),
+        ("tests/scenes/test_sfm.py::test_it[64]", "still life"),
+        ("tests/demo/test_demo_scene.py::test_it[fast-1.0]", "driver 0"),
         ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0"),
         ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-new-cloud]", "driver 1 in 8x1"),
         ("tests/stages/test_sort.py::test_it[1x32g-fast-1.0-new-8x1]", "driver 1 in 1x32"),
@@ -154,6 +157,12 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
 )
 def test_a_driver_s_tests_in_a_shape_are_a_group_and_else_a_file_s(identifier: str, wanted: str) -> None:
     assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}, {0: "8x1", 1: "16x1"}) == wanted
+
+
+def test_the_files_that_draw_the_still_life_are_named() -> None:
+    drawing = re.compile(r"^(from|import) (demo_photographs|walk_videos)\b", re.MULTILINE)
+    files = (ROOT / "tests").rglob("test_*.py")
+    assert {file.stem for file in files if drawing.search(file.read_text("utf-8"))} == STILL_LIFE
 
 
 def collected(folder: Path, source: pytest.Config.ArgsSource, **process: Any) -> list[str]:

@@ -33,6 +33,9 @@ name is at byte 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
 """Processor names set by `name_processor`, by the address of the device record's pointer to the name. They are kept
 here because the driver reads them at every build."""
+_places: dict[int, int | None] = {}
+"""Results of `_place`, by the address of the device record. Records of whole devices stay where they are as long as the
+process lives, and the search takes 5 ms."""
 
 
 @cache
@@ -65,7 +68,10 @@ def name_processor(device: cl.Device) -> str:
     """
     if not misnames_processors(device):
         return ""
-    address = _place(device.int_ptr)
+    record = device.int_ptr
+    if record not in _places:
+        _places[record] = _place(record)
+    address = _places[record]
     if address is None:
         return ""
     name = _text(_word(address)) or ""

@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from clsplat.arrays import Float32
 
@@ -109,6 +108,8 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
     If there are many vectors, the iterations use a sample of them. The initial centres lie along the direction of
     largest variance. A centre without vectors stays unchanged.
     """
+    from scipy import sparse  # imported here, as the import takes 0.1 s and few commands need it
+
     if size <= 1 or not np.ptp(vectors, axis=0).any():
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from clsplat.arrays import Float32, Float64
 from clsplat.scenes.thumbnail import SHARPNESS_SIDE_PX, THUMBNAIL_SIDE_PX, sharpness_of
@@ -166,6 +165,8 @@ def _windows(side: int) -> tuple[Float32, Float32]:
 
     Over the full spectrum, with the frequencies that a real transform leaves out, the weights sum to 1.
     """
+    from scipy import fft  # imported here, as the import takes 0.1 s and few commands need it
+
     hann = np.hanning(side + 2)[1:-1]
     squared = fft.fftfreq(side)[:, None] ** 2 + fft.rfftfreq(side)[None] ** 2
     weights = np.exp(-0.5 * squared / _LOW_PASS_CYCLES**2)
@@ -194,6 +195,8 @@ class BlockSpectra:
     @classmethod
     def of(cls, grey: Float32) -> BlockSpectra:
         """Transform the blocks of a frame (H, W) of values in [0, 1]."""
+        from scipy import fft  # as above
+
         height, width = grey.shape
         side, corners = _grid(height, width)
         blocks = np.stack([grey[top : top + side, left : left + side] for top, left in corners])
@@ -207,6 +210,8 @@ class BlockSpectra:
 
     def flow_from(self, earlier: BlockSpectra) -> Float64:
         """Return the motion (B, 2) of the blocks since an earlier frame, in longer sides; NaN without a match."""
+        from scipy import fft  # as above
+
         surface = fft.irfft2(self.spectra * earlier.spectra.conj() * _windows(self.side)[1], s=(self.side, self.side))
         surface *= np.float32(self.side**2)
         count = len(surface)

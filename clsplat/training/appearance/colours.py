@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
 
 from clsplat.config.colour_models import COLOUR_MODELS, GAIN_ENTRIES, ColourModel
 from clsplat.config.training import TrainConfig
@@ -38,6 +37,8 @@ from clsplat.training.appearance.view_neighbours import common
 from clsplat.training.step.inputs import ViewPart
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
     from clsplat.scenes.scene import Scene, View
 
 CODED_OCTAVES_PER_LIGHT_OCTAVE = 1 / 2.2
@@ -248,6 +249,8 @@ class ColoursOfAll(Appearance):
 
     @property
     def _pull(self) -> csr_array:
+        from scipy.sparse import csr_array, diags_array  # imported here, as in `common`
+
         told, cameras = self._by_points, [view.camera for view in self._scene.train_views]
         return csr_array(
             VIEW_PULL_WEIGHT * diags_array(told.astype(np.float64)) + NEIGHBOUR_PULL_WEIGHT * common(cameras, told)

@@ -7,14 +7,16 @@ The pictures hardly determine the common part, so `--appearance exposure` pulls 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
-from scipy.spatial import KDTree
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 NEIGHBOUR_DISTANCE_LIMIT = 2.5
 """Distance at which cameras stop being neighbours.
@@ -53,6 +55,9 @@ def common(cameras: Sequence[Camera], told: NDArray[np.bool_]) -> csr_array:
     dimensions (Wendland, Advances in Computational Mathematics 4, 1995). So the matrix is positive semidefinite, except
     for rounding to `NEIGHBOUR_WEIGHT_STEP`.
     """
+    from scipy.sparse import csr_array, diags_array  # here, as the import takes 0.2 s and few trainings need it
+    from scipy.spatial import KDTree
+
     numbers = np.flatnonzero(told)
     if not len(numbers):
         return csr_array((len(told), len(told)), dtype=np.float64)

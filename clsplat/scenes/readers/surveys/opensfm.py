@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float32, Float64, numbers
 from clsplat.errors import InputError, warn
@@ -138,6 +137,8 @@ def _lens(keys: Keys) -> Lens:
 
 
 def _image(name: str, shot: Keys, lenses: dict[str, Lens]) -> PosedImage:
+    from scipy.spatial.transform import Rotation  # imported here, as the import takes 0.1 s and few commands need it
+
     camera = shot.text("camera")
     if camera not in lenses:
         raise InputError(f"{shot.where}: its camera {short(camera)} is not among the file's 'cameras'; export it again")

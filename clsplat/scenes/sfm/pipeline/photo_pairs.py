@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Pair = tuple[int, int]
 
@@ -106,6 +106,8 @@ def near_pairs(positions: NDArray[Any], neighbours: int) -> list[Pair]:
     positions: (N, 2), NaN where unknown. Among equal distances the photograph with the lower index is nearer, unless
         more than 2 `neighbours` photographs are as near.
     """
+    from scipy.spatial import cKDTree  # here, as the import takes 0.1 s and training does without
+
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     places = positions[known]
     most = min(2 * neighbours + 1, len(known))
@@ -124,6 +126,9 @@ def shared_tracks(counts: Sequence[int], matches: Mapping[Pair, NDArray[Any]]) -
     counts: number of features of each photograph.
     matches: for pairs of photographs, the matching features (M, 2), by their indices in each photograph.
     """
+    from scipy.sparse import coo_array, csr_array  # here, as the import takes 0.2 s and training does without
+    from scipy.sparse.csgraph import connected_components
+
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     ends = [first[list(pair)] + rows.astype(np.int64) for pair, rows in matches.items()]
     features, places = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *ends]), return_inverse=True)
@@ -161,6 +166,9 @@ def unconnected(count: int, verified: Iterable[Pair]) -> list[int]:
 
     count: number of photographs. verified: pairs with verified matches.
     """
+    from scipy.sparse import coo_array  # as above
+    from scipy.sparse.csgraph import connected_components
+
     pairs = np.array(sorted(verified), np.int64).reshape(-1, 2)
     joins = coo_array((np.ones(len(pairs), np.bool_), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     _, group = connected_components(joins, directed=False)
