@@ -31,9 +31,9 @@ CPU_STEP_ROWS = 128
 """Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
 is read in runs long enough for prefetching. With groups of a single vector a step takes 1.5 times as long."""
 
-STEP_REGISTERS = 88
+STEP_REGISTERS = 80
 """Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
-more items at a time help more than registers. Clang's code for NVIDIA spills nothing with 88, and 8 bytes with 80."""
+more items at a time help more than registers. Clang's code for NVIDIA spills nothing with 80, and 64 bytes with 72."""
 
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
@@ -359,7 +359,7 @@ def _inputs(
     gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
 ) -> tuple[object, ...]:
     """The arguments that `project_grad` and `project_step` share, after the number of rows."""
-    # If the slots are already summed, the kernel does not read first_slots, and tile_counts is a placeholder.
+    # If the slots are already summed, the kernel does not use first_slots, and tile_counts is a placeholder.
     first_slots = slots.first_slots or projected.tile_counts
     counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
     return (gaussians.coefficients, camera_array, *counts)
