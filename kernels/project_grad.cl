@@ -18,6 +18,9 @@
 //     s_k.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
+#if defined(ADAM) && LANES == 1
+#define OWN_ROW
+#endif
 #include "shared/math.h"
 #ifdef RAYS
 #define NEEDS_TANGENTS
@@ -119,7 +122,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #define ROW_ALIGNED __attribute__((aligned(4 * ABREAST)))
 #define SH_FLOATS (3 * SH_HIGHER) // number of floats in a Gaussian's SH bands from degree 1 on
 // MODEL(EACH) calls the macro EACH for each array of the model, with the array's number, its name, floats per row,
-// gradients, and values of the fields root and limit2 of Step (shared/adam.h).
+// gradients or their place, and values of the fields root and limit2 of Step (shared/adam.h).
 #ifdef NO_SH_REST
 #define ARRAYS 5
 #define SH_REST(EACH)
@@ -175,12 +178,12 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 }
 #else
 #define ROLLED _Pragma("unroll 1")
-// Arguments for the update of one array of the model by a work-group. gradients (rows, width); the scalars are as in
-// Step. These structs are in local memory, because so many pointers do not fit into the scalar registers of AMD's GPUs.
+// Arguments for the update of one array of the model by a work-group. begin: where the array's gradients (rows, width)
+// begin in local memory; the other scalars are as in Step. These structs are in local memory, because so many pointers
+// do not fit into the scalar registers of AMD's GPUs.
 typedef struct {
   Stepped model;
-  __local const float *gradients;
-  uint width;
+  ushort begin, width;
   float rate, root, limit2;
 } GroupStep;
 #endif
@@ -262,10 +265,20 @@ __kernel void project_step(
 #else // LANES == 1
   // Each item computes the gradients of a Gaussian. Then the items together update one array of the model after
   // another.
-  __local float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
-  __local float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
-  __local int in_view[ROWS];
+  //
+  // `gradients` has the SH coefficients, then the gradients of sh_rest, and after its update those of all other arrays.
+  // So a group takes little local memory, and more groups fit into a unit. The constants are the arrays' places in it.
+  __local float gradients[SH_FLOATS * ROWS] ROW_ALIGNED;
+  enum {
+    by_sh_rest = 0,
+    by_mean = 0,
+    by_quaternion = 3 * ROWS,
+    by_log_scale = 7 * ROWS,
+    by_opacity = 10 * ROWS,
+    by_sh_dc = 11 * ROWS
+  };
 #if defined(SPARSE) || defined(VISIBLE)
+  __local int in_view[ROWS];
 #define ROW_SHOWN(k, width) -in_view[(k) / (width)]
 #else
 #define ROW_SHOWN(k, width) -1
@@ -278,16 +291,18 @@ __kernel void project_step(
   __local GroupStep steps[ARRAYS];
   const uint me = get_local_id(0), first_row = get_global_id(0) - me;
   MODEL_ROWS(first_row)
-  const uint rows = first_row < end && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), end - first_row) : 0;
+  const uint rows = first_row < end ? min((uint)get_local_size(0), end - first_row) : 0;
+  const uint stopped = readback[READBACK_STOPPED];
   const uint own = ABREAST * me, stride = ABREAST * get_local_size(0);
   const int aligned = first_row % ABREAST == 0; // false only if a driver allows fewer than ABREAST items in a group
-#define GROUP_STEP(number, group, columns, by, root, limit2)                                                           \
-  steps[number] = (GroupStep){{group, first_##group, second_##group}, by, columns, rate_##group, root, limit2};
+#define GROUP_STEP(number, group, columns, by, root, limit2) /* sh_rest is the first */                                \
+  steps[(number + 1) % ARRAYS] =                                                                                       \
+      (GroupStep){{group, first_##group, second_##group}, by, columns, rate_##group, root, limit2};
   if (me == 0) {
     MODEL(GROUP_STEP)
   }
-  in_view[me] = me < rows && tile_counts[first_row + me] > 0;
 #if defined(SPARSE) || defined(VISIBLE)
+  in_view[me] = me < rows && tile_counts[first_row + me] > 0;
   barrier(CLK_LOCAL_MEM_FENCE);
 #endif
   // Adjacent items read adjacent SH coefficients. If each item read its own row, every access would touch a cache line
@@ -295,41 +310,57 @@ __kernel void project_step(
   __global const float *from = sh_rest + (size_t)sh_width * first_row;
   const uint floats = sh_width * rows, whole_floats = aligned ? floats / ABREAST * ABREAST : 0;
 #define WANTED(k) ((k) < whole_floats && (ROW_SHOWN(k, sh_width) | ROW_SHOWN((k) + ABREAST - 1, sh_width)))
-  for (uint k = own; k < whole_floats; k += 4 * stride) { // four loads start before the first store waits
-    floatA ahead[4];
-    UNROLL for (uint i = 0; i < 4; ++i) {
+  // All loads here start before the barrier, so that an item waits for them once.
+  const size_t mine = first_row + me;
+  float mean[3], quaternion[4], log_scale[3], logit[1];
+  uint tiles[1] = {0}, slot[1] = {0};
+  if (me < rows && ROW_SHOWN(me, 1)) {
+    tiles[0] = tile_counts[mine];
+    slot[0] = first_slots[mine];
+    UNROLL for (int k = 0; k < 3; ++k) mean[k] = means[3 * mine + k];
+    UNROLL for (int k = 0; k < 4; ++k) quaternion[k] = quaternions[4 * mine + k];
+    UNROLL for (int k = 0; k < 3; ++k) log_scale[k] = log_scales[3 * mine + k];
+    logit[0] = opacity_logits[mine];
+  }
+  for (uint k = own; k < whole_floats; k += 6 * stride) {
+    floatA ahead[6];
+    UNROLL for (uint i = 0; i < 6; ++i) {
       if (WANTED(k + i * stride)) ahead[i] = LOADA(from + k + i * stride);
     }
-    UNROLL for (uint i = 0; i < 4; ++i) {
-      if (WANTED(k + i * stride)) *(__local floatA *)(by_sh_rest + k + i * stride) = ahead[i];
+    UNROLL for (uint i = 0; i < 6; ++i) {
+      if (WANTED(k + i * stride)) *(__local floatA *)(gradients + k + i * stride) = ahead[i];
     }
   }
-  for (uint k = whole_floats + me; k < floats; k += stride / ABREAST) by_sh_rest[k] = from[k];
+  for (uint k = whole_floats + me; k < floats; k += stride / ABREAST) gradients[k] = from[k];
   barrier(CLK_LOCAL_MEM_FENCE);
-  __local float *own_sh_rest = by_sh_rest + sh_width * me; // gradients_of replaces the coefficients by their gradients
+  __local float *own_sh_rest = gradients + sh_width * me; // gradients_of replaces the coefficients by their gradients
   int any = 0, shown[1] = {0};
-  if (me < rows)
-    any = gradients_of(end, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
-                       quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, own_sh_rest, shown,
-                       &d PENALTY_WEIGHTS REGION_NUMBERS);
-  UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;
-  UNROLL for (int k = 0; k < 4; ++k) by_quaternion[4 * me + k] = any ? d.quaternion[k].all : 0.0f;
-  UNROLL for (int k = 0; k < 3; ++k) by_log_scale[3 * me + k] = any ? d.scale[k].all : 0.0f;
-  by_opacity[me] = any ? d.opacity.all : 0.0f;
-  UNROLL for (int k = 0; k < 3; ++k) by_sh_dc[3 * me + k] = any ? SH_CONSTANT * d.colour[k].all : 0.0f;
+  if (me < rows && !stopped)
+    any = gradients_of(end, mine, coefficients, camera, tiles, slot, slots, splats, mean, quaternion, log_scale, logit,
+                       sh_rest, VIEW_ARRAYS, own_sh_rest, shown, &d PENALTY_WEIGHTS REGION_NUMBERS);
 #ifndef NO_SH_REST
   for (uint k = any ? 3 * (SH_USED(coefficients) - 1) : 0; k < sh_width; ++k) own_sh_rest[k] = 0.0f;
 #endif
   barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // some items read a row that other items write
   ROLLED for (int number = 0; number < ARRAYS; ++number) { // not unrolled: the code would be six times as long
+    if (number == ARRAYS - 5) {                            // sh_rest is done
+      barrier(CLK_LOCAL_MEM_FENCE);
+      UNROLL for (int k = 0; k < 3; ++k) gradients[by_mean + 3 * me + k] = any ? d.mean[k].all : 0.0f;
+      UNROLL for (int k = 0; k < 4; ++k) gradients[by_quaternion + 4 * me + k] = any ? d.quaternion[k].all : 0.0f;
+      UNROLL for (int k = 0; k < 3; ++k) gradients[by_log_scale + 3 * me + k] = any ? d.scale[k].all : 0.0f;
+      gradients[by_opacity + me] = any ? d.opacity.all : 0.0f;
+      UNROLL for (int k = 0; k < 3; ++k) gradients[by_sh_dc + 3 * me + k] = any ? SH_CONSTANT * d.colour[k].all : 0.0f;
+      barrier(CLK_LOCAL_MEM_FENCE);
+    }
     const GroupStep step = steps[number];
+    __local const float *by = gradients + step.begin;
     const Step s = {step.rate, step.root, beta1, beta2, epsilon, step.limit2, readback};
-    const uint width = step.width, count = rows * width, whole = aligned ? count : 0;
+    const uint width = step.width, count = stopped ? 0 : rows * width, whole = aligned ? count : 0;
     const size_t begin = (size_t)width * first_row, at = begin + own;
     Stepped model = {step.model.parameters + at, step.model.first + at, step.model.second + at};
     uint left = 0; // a bit for each vector that has a refused element or goes past the last row
     ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
-      const floatA g = *(__local const floatA *)(step.gradients + k);
+      const floatA g = *(__local const floatA *)(by + k);
       const intA taken =
           (intA)(TAKEN(k, width, g.x), TAKEN(k + 1, width, g.y), TAKEN(k + 2, width, g.z), TAKEN(k + 3, width, g.w));
       if (ANYA(taken) && (k + ABREAST > whole || !step_vector(0, g, taken, s, model))) left |= bit;
@@ -337,7 +368,7 @@ __kernel void project_step(
     }
     for (uint k = own; left != 0; k += stride, left >>= 1)
       for (uint i = k; (left & 1) && i < min(k + ABREAST, count); ++i)
-        if (TAKEN(i, width, step.gradients[i])) step_element(begin + i, step.gradients[i], s, step.model);
+        if (TAKEN(i, width, by[i])) step_element(begin + i, by[i], s, step.model);
   }
 #endif
 }

@@ -30,9 +30,9 @@ CPU_STEP_ROWS = 128
 """Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
 is read in runs long enough for prefetching. With groups of a single vector a step takes 1.5 times as long."""
 
-STEP_REGISTERS = 88
+STEP_REGISTERS = 80
 """Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
-more items at a time help more than registers. Clang's code for NVIDIA spills nothing with 88, and 8 bytes with 80."""
+more items at a time help more than registers. Clang's code for NVIDIA spills nothing with 80, and 64 bytes with 72."""
 
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
@@ -348,7 +348,7 @@ def _defines(
 
 def _inputs(gaussians: DeviceGaussians, view: ViewSlots) -> tuple[object, ...]:
     """The arguments that `project_grad` and `project_step` share, after the number of rows."""
-    # If the slots are already summed, the kernel does not read first_slots, and tile_counts is a placeholder.
+    # If the slots are already summed, the kernel does not use first_slots, and tile_counts is a placeholder.
     projected, slots = view.projected, view.slots
     counts = (projected.tile_counts, slots.first_slots or projected.tile_counts, slots.values, projected.splats)
     return (gaussians.coefficients, view.camera_array, *counts)

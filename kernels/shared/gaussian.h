@@ -77,7 +77,7 @@ static inline floatL compensation(floatL det0, floatL det) {
 #ifndef RAYS
 // Recomputes J A and its minors in the lanes of `which`, equation (57) of docs/gradients.md. It uses two floats up to
 // the last step in which terms cancel.
-static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
+static inline void refine(const uint *row, PARAMETER *quaternions, __constant float *camera, intL which,
                           Projection *p) {
   Double r[9];
   const floatL length = rotation2_of(row, quaternions, p->length, r);
@@ -105,8 +105,8 @@ static inline void refine(const uint *row, __global const float *quaternions, __
 
 // Projects LANES Gaussians, equations (1) and (3) to (7) of docs/gradients.md: fills *p, and returns 0 if every lane is
 // culled. Conditions are written so that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
-static inline int project_gaussians(const uint *row, __global const float *means, __global const float *quaternions,
-                                    __global const float *log_scales, __constant float *camera, Projection *p) {
+static inline int project_gaussians(const uint *row, PARAMETER *means, PARAMETER *quaternions, PARAMETER *log_scales,
+                                    __constant float *camera, Projection *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
   const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
   p->x = in_x.high;

@@ -31,3 +31,10 @@ static inline float fma1(float a, float b, float c) {
 // sum + x, for a loop that adds adjacent floats. With AVX-512, Intel's CPU runtime would otherwise recognise a sum in
 // such a loop and reorder its additions.
 static inline float added(float sum, float x) { return fma(x, 1.0f, sum); }
+
+// The type, with address space, of elements of the model's arrays. With OWN_ROW a work-item has a copy of its own row.
+#ifdef OWN_ROW
+#define PARAMETER const float
+#else
+#define PARAMETER __global const float
+#endif

@@ -24,7 +24,7 @@ static inline void rotation_of(const floatL *q, floatL *r) {
 
 // Sets r (9) to the rotation matrix in two floats, times the square of the returned length: equation (57) of
 // docs/gradients.md. length: the length of the raw quaternion.
-static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
+static inline floatL rotation2_of(const uint *row, PARAMETER *quaternions, floatL length, Double *r) {
   // The quaternion is scaled by a power of two, which is exact, so that the low parts of products are not denormal.
   const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);
   const floatL w = GATHER(quaternions, 4, 0) / size, x = GATHER(quaternions, 4, 1) / size;

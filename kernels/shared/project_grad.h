@@ -2,30 +2,52 @@
 // LANES Gaussians and to the camera's lens. Equation numbers refer to docs/gradients.md, with RAYS to docs/cameras.md.
 // project_grad.cl includes this file after splat.h, gaussian.h and sh.h, with RAYS also tangent.h.
 
-// The type, with address space, of the gradients of the SH bands from degree 1 on. Their array holds all Gaussians
-// (global), those of a work-item (private), or those of a group (local).
-#if !defined(ADAM)
-#define SH_GRADIENT __global float
-#elif LANES > 1
-#define SH_GRADIENT float
-#else
+// OWN_ROW: a work-item has copied its Gaussian's parameters, number of tiles and first slot. Its SH coefficients are in
+// local memory, and their gradients overwrite them.
+//
+// LISTED: the type, with address space, of tile_counts and first_slots. SH_COEFFICIENT: that of sh_rest. SH_GRADIENT:
+// that of its gradients, of all Gaussians (global), of those of a work-item (private) or of a group (local). OWN: the
+// index of a Gaussian's row in arrays of the types PARAMETER and LISTED. ADDENDS_AHEAD makes a GPU load four slots of a
+// Gaussian before it adds them up.
+#ifdef OWN_ROW
+#define LISTED const uint
+#define SH_COEFFICIENT __local const float
 #define SH_GRADIENT __local float
-#define SH_IN_PLACE // the gradients overwrite the SH coefficients in local memory
-#endif
-
-// Makes a GPU load four slots of a Gaussian before it adds them up.
-#ifdef SH_IN_PLACE
+#define OWN(row) 0
 #define ADDENDS_AHEAD _Pragma("unroll 4")
 #else
+#define LISTED __global const uint
+#define SH_COEFFICIENT __global const float
+#ifdef ADAM
+#define SH_GRADIENT float
+#else
+#define SH_GRADIENT __global float
+#endif
+#define OWN(row) (row)
 #define ADDENDS_AHEAD
 #endif
 
-// FOR_HIGHER loops over the SH coefficients k from 1 to used - 1. SH_HIGHER: the largest number of such coefficients.
-#define SH_HIGHER 15
+#define SH_HIGHER 15 // the largest number of SH coefficients from degree 1 on
+
+// The gradients of a Gaussian's SH coefficient and of its basis function, equations (39) and (40) of docs/gradients.md.
+// f, d_f: the coefficient and its gradient, three channels each; d_colour: the colour's gradient; basis: the basis
+// function. Returns the gradient of the basis function.
+__attribute__((always_inline)) static inline float coefficient_gradient(SH_COEFFICIENT *f, float4 d_colour, float basis,
+                                                                        SH_GRADIENT *d_f) {
+  const float weight = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
+#ifndef NO_SH_REST // set in steps that do not update sh_rest (OptimiserConfig.sh_rest_every)
+  d_f[0] = basis * d_colour.x;
+  d_f[1] = basis * d_colour.y;
+  d_f[2] = basis * d_colour.z;
+#endif
+  return weight;
+}
+
+// FOR_DEGREE loops over the SH coefficients k of a degree, unrolled, if all of them are used.
 #if LANES == 1
-#define FOR_HIGHER(k, used) UNROLL for (int k = 1; k <= SH_HIGHER; ++k) if (k < (used))
-#else
-#define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
+#define FOR_DEGREE(degree, k, used)                                                                                    \
+  if ((used) >= ((degree) + 1) * ((degree) + 1))                                                                       \
+  UNROLL for (int k = (degree) * (degree); k < ((degree) + 1) * ((degree) + 1); ++k)
 #endif
 
 // Weights of the penalties on opacity and scales, as parameters and as arguments, each after a comma, in the order of
@@ -63,10 +85,9 @@ static inline void clear_lanes(const int *trained, Gradients *d) {
 // Sets `shown` (LANES) to 1 for visible rows, and writes their rows of screen, contributions, by_lens and d_sh_rest.
 // Row 0 of d_sh_rest belongs to first_row. Visible Gaussians outside the region (REGION) get zeros in all results.
 static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
-                               __global const uint *tile_counts, __global const uint *first_slots,
-                               __global const float *slots, __global const float *splats, __global const float *means,
-                               __global const float *quaternions, __global const float *log_scales,
-                               __global const float *opacity_logits, __global const float *sh_rest,
+                               LISTED *tile_counts, LISTED *first_slots, __global const float *slots,
+                               __global const float *splats, PARAMETER *means, PARAMETER *quaternions,
+                               PARAMETER *log_scales, PARAMETER *opacity_logits, __global const float *sh_rest,
                                __global float *screen,
 #ifdef CONTRIBUTIONS
                                __global float *contributions,
@@ -76,7 +97,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
                                SH_GRADIENT *d_sh_rest, int *shown, Gradients *d PENALTY_PARAMETERS REGION_PARAMETERS) {
   uint row[LANES];
-  for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
+  for (uint lane = 0; lane < LANES; ++lane) row[lane] = OWN(first_row + lane < n ? first_row + lane : n - 1);
   const uint lanes_used = n - first_row < LANES ? n - first_row : LANES;
   Lanes m[SLOT_STRIDE];
   int any = 0;
@@ -87,7 +108,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   Lanes whitening[3]; // zero for invisible Gaussians, whose splats are uninitialised
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
-    const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
+    const uint count = lane < lanes_used ? tile_counts[OWN(first_row + lane)] : 0;
     shown[lane] = count > 0;
 #ifdef REGION
     trained[lane] = 0;
@@ -95,7 +116,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     if (count == 0) continue;
 #ifdef REGION
     const size_t at = first_row + lane;
-    trained[lane] = in_region(means + 3 * at REGION_NUMBERS);
+    trained[lane] = in_region(means + 3 * OWN(at) REGION_NUMBERS);
     if (!trained[lane]) {
       frozen = 1;
       for (int k = 0; k < 2; ++k) screen[2 * at + k] = 0.0f;
@@ -117,7 +138,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     __global const float *slot = slots + (size_t)SLOT_STRIDE * (first_row + lane);
     const uint addends = 1;
 #else
-    __global const float *slot = slots + (size_t)SLOT_STRIDE * first_slots[first_row + lane];
+    __global const float *slot = slots + (size_t)SLOT_STRIDE * first_slots[OWN(first_row + lane)];
     const uint addends = count;
 #endif
     float sums[SLOT_STRIDE];
@@ -126,8 +147,11 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
       for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] += slot[field];
     }
     for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
-#ifndef RAYS
     __global const float *splat = splats + (size_t)SPLAT_SIZE * (first_row + lane);
+    FOR_AXES(k) { // equation (38) of docs/gradients.md: a clamped channel has no gradient
+      if (!(splat[SPLAT_RED + k] > 0.0f)) m[SLOT_RED + k].lane[lane] = 0.0f;
+    }
+#ifndef RAYS
     whitening[0].lane[lane] = splat[SPLAT_L11];
     whitening[1].lane[lane] = splat[SPLAT_L12];
     whitening[2].lane[lane] = splat[SPLAT_L22];
@@ -139,28 +163,31 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     return 1;
   }
 #endif
-#ifdef RAYS
-  RayProjection p;
-  if (!any || !project_ray(first_row, means, quaternions, log_scales, camera, &p)) return 0;
-  whitening[0].all = WHITEN * sqrt(p.syy / p.det);
-  whitening[1].all = -(p.sxy / p.syy) * whitening[0].all;
-  whitening[2].all = WHITEN / sqrt(p.syy);
-#else
-  Projection p;
-  if (!any || !project_gaussians(row, means, quaternions, log_scales, camera, &p)) return 0;
-#endif
-  const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
-  const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
+  if (!any) return 0;
 
-  // Opacity, equations (29) and (41) of docs/gradients.md: the sum of g is o dL/do, and do/dlogit = o (1 - o).
-  Lanes d_screen[2];
-  d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also for o close to 1
+  // Opacity, equations (29) and (41) of docs/gradients.md: the sum of g is o dL/do, and do/dlogit = o (1 - o). This
+  // comes before the projection, which needs the most registers.
+  d->opacity.all = m[SLOT_G].all * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also for o close to 1
 #ifdef PENALTIES
   // Equation (91) of docs/gradients.md
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
   d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
 #endif
 
+#ifdef RAYS
+  RayProjection p;
+  if (!project_ray(OWN(first_row), means, quaternions, log_scales, camera, &p)) return 0;
+  whitening[0].all = WHITEN * sqrt(p.syy / p.det);
+  whitening[1].all = -(p.sxy / p.syy) * whitening[0].all;
+  whitening[2].all = WHITEN / sqrt(p.syy);
+#else
+  Projection p;
+  if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return 0;
+#endif
+  const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
+  const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
+
+  Lanes d_screen[2];
 #ifdef RAYS // d_mx, d_my: along e1 and e2 of the tangent plane; d_screen: per pixel at the mean
   const floatL d_mx = INVERSE_WHITEN2 * m_gu, d_my = INVERSE_WHITEN2 * m_gv;
   const float side_x = sqrt(fma1(p.t.k[0], p.t.k[0], p.t.k[1] * p.t.k[1]));
@@ -343,30 +370,25 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
     if (!TRAINED[lane]) continue;
-    __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
-    const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
-                                     splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN].lane[lane] : 0.0f,
-                                     splat[SPLAT_BLUE] > 0.0f ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
+    const float4 d_colour = (float4)(m[SLOT_RED].lane[lane], m[SLOT_GREEN].lane[lane], m[SLOT_BLUE].lane[lane], 0.0f);
     d->colour[0].lane[lane] = d_colour.x;
     d->colour[1].lane[lane] = d_colour.y;
     d->colour[2].lane[lane] = d_colour.z;
     SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
-#ifdef SH_IN_PLACE
-    __local const float *f = d_f;
+#ifdef OWN_ROW
+    SH_COEFFICIENT *f = d_f;
 #else
-    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
+    SH_COEFFICIENT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
 #endif
-    FOR_HIGHER(k, SH_USED(coefficients)) {
-      weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
-      f += 3;
-#ifndef NO_SH_REST // set in steps that do not update sh_rest (OptimiserConfig.sh_rest_every)
-      const float along = basis[k].lane[lane];
-      d_f[0] = along * d_colour.x;
-      d_f[1] = along * d_colour.y;
-      d_f[2] = along * d_colour.z;
-      d_f += 3;
+#define COEFFICIENT(k)                                                                                                 \
+  weight[k].lane[lane] = coefficient_gradient(f, d_colour, basis[k].lane[lane], d_f), f += 3, d_f += 3
+#if LANES == 1 // a branch for each degree, unrolled
+    FOR_DEGREE(1, k, SH_USED(coefficients)) COEFFICIENT(k);
+    FOR_DEGREE(2, k, SH_USED(coefficients)) COEFFICIENT(k);
+    FOR_DEGREE(3, k, SH_USED(coefficients)) COEFFICIENT(k);
+#else
+    for (int k = 1; k < SH_USED(coefficients); ++k) COEFFICIENT(k);
 #endif
-    }
   }
   floatL d_v[3];
   sh_direction_gradient(SH_USED(coefficients), vx, vy, vz, &weight[0].all, d_v);

@@ -15,19 +15,19 @@
       centre_y, centre_z, nearest2, farthest2
 
 // The coordinate of a mean (3) along an axis. It has the bits of `TrainedRegion.coordinates`, so nothing is fused.
-static inline float region_coordinate(__global const float *mean, const float x, const float y, const float z) {
+static inline float region_coordinate(PARAMETER *mean, const float x, const float y, const float z) {
   return (mean[0] * x + mean[1] * y) + mean[2] * z;
 }
 
 // The square of a mean's distance from the centre, at most FLT_MAX, with the bits of `TrainedRegion.squares`.
-static inline float region_square(__global const float *mean, const float x, const float y, const float z) {
+static inline float region_square(PARAMETER *mean, const float x, const float y, const float z) {
   const float across = mean[0] - x, along = mean[1] - y, above = mean[2] - z;
   const float square = (across * across + along * along) + above * above;
   return square < FLT_MAX ? square : FLT_MAX;
 }
 
 // 1 if the mean of a Gaussian is in the region, otherwise 0.
-static inline int in_region(__global const float *mean REGION_PARAMETERS) {
+static inline int in_region(PARAMETER *mean REGION_PARAMETERS) {
   const float first = region_coordinate(mean, first_x, first_y, first_z);
   const float second = region_coordinate(mean, second_x, second_y, second_z);
   const float square = region_square(mean, centre_x, centre_y, centre_z);

@@ -18,8 +18,8 @@ typedef struct {
 
 // Projects Gaussian i, equations (8) to (12) of docs/cameras.md: fills *p, and returns 0 if the Gaussian is culled.
 // Conditions are written so that NaN culls.
-static inline int project_ray(size_t i, __global const float *means, __global const float *quaternions,
-                              __global const float *log_scales, __constant float *camera, RayProjection *p) {
+static inline int project_ray(size_t i, PARAMETER *means, PARAMETER *quaternions, PARAMETER *log_scales,
+                              __constant float *camera, RayProjection *p) {
   const float x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
   const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
   const float at[3] = {in_x.high, in_y.high, in_z.high};
@@ -34,7 +34,7 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   // Equations (11), (12) of docs/cameras.md: M = e A S / distance, with two more columns for the low-pass. The
   // determinant is the sum of the squared minors.
   const Tangent t = p->t;
-  __global const float *raw = quaternions + 4 * i;
+  PARAMETER *raw = quaternions + 4 * i;
   float norm2 = 0.0f, r[9];
   for (int k = 0; k < 4; ++k) norm2 = fma1(raw[k], raw[k], norm2);
   if (!(norm2 > 1e-30f && norm2 < 1e30f)) return 0;

@@ -69,7 +69,7 @@ def test_every_scene_gets_the_inputs_of_its_code(monkeypatch: pytest.MonkeyPatch
 
 
 def test_rules_of_the_kernels_that_were_measured() -> None:
-    (commit,) = MEASURED
+    commit = "5ea10cd9"
     assert rules_of("blend", commit) == MEASURED[commit]["blend"] + EVERYWHERE
     assert rules_of("ranges", commit) == BY_ITEM["ranges"] + EVERYWHERE, "as in the present kernels"
     counted = {row.get("counted", row["commit"]) for row in json.loads(CALIBRATION.read_text())}

@@ -206,17 +206,20 @@ def group_sum(rounds: Rounds) -> Rule:
     return Rule("for (uint i = get_local_id(0); i < count; i += ITEMS) sum += values[i];", rounds, mark=("global", 1))
 
 
-def _abreast(run: Run, width: float) -> float:
-    """Rounds per wave over a group's rows of this width, if an item takes ABREAST elements in a round."""
-    return math.ceil(DEFAULT_GROUP_ITEMS * width / ABREAST / run.wave) * run.wave / DEFAULT_GROUP_ITEMS
+def abreast(run: Run, width: float, ahead: int = 1) -> float:
+    """Rounds per wave over a group's rows of this width, if an item takes `ahead` times ABREAST elements in a round."""
+    waves = DEFAULT_GROUP_ITEMS // run.wave
+    runs = math.ceil(DEFAULT_GROUP_ITEMS * width / ABREAST / run.wave)  # of elements side by side, in turn to each wave
+    return sum(math.ceil(len(range(wave, runs, waves)) / ahead) for wave in range(waves)) / waves
 
 
 def _adam(run: Run) -> float:
-    return sum(_abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * bands(run)))
+    return sum(abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * bands(run)))
 
 
-ABREAST = 4
-"""Elements that an item steps at once: ABREAST in adam.h."""
+ABREAST, COPIED_AHEAD = 4, 6
+"""Elements that an item steps at once: ABREAST in adam.h; and loads that start together in the copy of SH
+coefficients."""
 ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _adam, mark=("global", 6))
 """Adam's loop in `project_step`."""
 
@@ -408,10 +411,15 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project_step": (
         REFINED,
         ADDENDS,
-        Rule("for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * bands(run) / 4), mark=("global", 4)),
+        Rule(
+            "for (uint k = own; k < whole_floats;",
+            lambda run: abreast(run, 3 * bands(run), COPIED_AHEAD),
+            mark=("global", COPIED_AHEAD),
+        ),
         Rule("for (uint k = whole_floats + me;", never),  # only for the last row
         Rule("for (uint k = any ?", lambda run: 3 * bands(run), mark=("shared", 1)),
         Rule("for (int number = 0; number < ARRAYS; ++number)", lambda run: 6),
+        Rule("gradients[by_", lambda run: 1 / 6, part=True, inside="for (int number = 0;"),  # after sh_rest
         ADAM,
         Rule("for (uint k = own; left != 0;", never),  # only for refused steps and the last row
         Rule("for (uint i = k; (left & 1)", never),

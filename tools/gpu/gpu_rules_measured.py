@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from gpu_rules import ADDENDS, BEFORE_PAIRS, REFINED, Rounds, Rule, bands, group_sum, never
+from gpu_rules import ADAM, ADDENDS, BEFORE_PAIRS, REFINED, Rounds, Rule, abreast, bands, group_sum, never
 from gpu_run import BLOCKS, Run
 
 from clsplat.layouts.columns import PLAIN_SLOTS
@@ -95,6 +95,21 @@ MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
             Rule("first[i] = 0.0f;", never, part=True),  # only for a refused step
             Rule("second[i] = again ? 0.0f", never, part=True),
             Rule("atomic_inc(s.readback", never, part=True),
+        ),
+    },
+    "37c3be07": {
+        "project_step": (
+            REFINED,
+            ADDENDS,
+            Rule(
+                "for (uint k = own; k < whole_floats;", lambda run: abreast(run, 3 * bands(run) / 4), mark=("global", 4)
+            ),
+            Rule("for (uint k = whole_floats + me;", never),  # only for the last row
+            Rule("for (uint k = any ?", lambda run: 3 * bands(run), mark=("shared", 1)),
+            Rule("for (int number = 0; number < ARRAYS; ++number)", lambda run: 6),
+            ADAM,
+            Rule("for (uint k = own; left != 0;", never),  # only for refused steps and the last row
+            Rule("for (uint i = k; (left & 1)", never),
         ),
     },
 }

@@ -104,7 +104,7 @@ VARIANTS = (
     USUAL,
     *(Variant(shape, shape=shape) for shape in ("1x32", "1x128", "1x256")),
     *(Variant(shape, ("blend_grad",), shape) for shape in ("1x32g", "1x64g", "1x32s", "1x64s")),
-    *(Variant(f"{most} registers", ("project_step",), registers={"project_grad": most}) for most in (80, 64, 128)),
+    *(Variant(f"{most} registers", ("project_step",), registers={"project_grad": most}) for most in (72, 88, 128)),
     Variant("registers not limited", ("project_step",), registers={"project_grad": 0}),
     *(Variant(f"{most} registers", ("blend",), registers={"blend": most}) for most in (64, 48)),
     *(Variant(f"{most} registers", ("blend_grad",), registers={"blend_grad": most}) for most in (64, 80, 128)),
