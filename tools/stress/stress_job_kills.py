@@ -44,7 +44,7 @@ KILL_SECONDS = 1.5
 """Longest time from progress to a kill."""
 FINISH_SECONDS = 1200.0
 """Seconds that the tasks have to end after the last kill."""
-RESULTS = ("*.count", "merged.ply", "model.ply", "blocks/*/model.ply")
+RESULTS = ("*.count", "merged.ply", "model.ply", "blocks/*/model.ply", "**/appearance.json")
 """Patterns of the files that are compared."""
 _ATTEMPT = re.compile(r"^--- .*, process (\d+): ", re.MULTILINE)
 
