@@ -266,7 +266,7 @@ __kernel void project_step(
   // Each item computes the gradients of a Gaussian. Then the items together update one array of the model after
   // another.
   //
-  // `gradients` has the SH coefficients, then the gradients of sh_rest, and after its update those of all other arrays.
+  // `gradients` has the SH coefficients, then the gradients of sh_rest, and once sh_rest is stepped, all others.
   // So a group takes little local memory, and more groups fit into a unit. The constants are the arrays' places in it.
   __local float gradients[SH_FLOATS * ROWS] ROW_ALIGNED;
   enum {
@@ -295,7 +295,7 @@ __kernel void project_step(
   const uint stopped = readback[READBACK_STOPPED];
   const uint own = ABREAST * me, stride = ABREAST * get_local_size(0);
   const int aligned = first_row % ABREAST == 0; // false only if a driver allows fewer than ABREAST items in a group
-#define GROUP_STEP(number, group, columns, by, root, limit2) /* sh_rest is the first */                                \
+#define GROUP_STEP(number, group, columns, by, root, limit2) /* the last array is stepped first */                     \
   steps[(number + 1) % ARRAYS] =                                                                                       \
       (GroupStep){{group, first_##group, second_##group}, by, columns, rate_##group, root, limit2};
   if (me == 0) {
@@ -310,7 +310,7 @@ __kernel void project_step(
   __global const float *from = sh_rest + (size_t)sh_width * first_row;
   const uint floats = sh_width * rows, whole_floats = aligned ? floats / ABREAST * ABREAST : 0;
 #define WANTED(k) ((k) < whole_floats && (ROW_SHOWN(k, sh_width) | ROW_SHOWN((k) + ABREAST - 1, sh_width)))
-  // All loads here start before the barrier, so that an item waits for them once.
+  // An item waits once for all its parameters, and once for each six vectors of SH coefficients.
   const size_t mine = first_row + me;
   float mean[3], quaternion[4], log_scale[3], logit[1];
   uint tiles[1] = {0}, slot[1] = {0};
@@ -341,7 +341,7 @@ __kernel void project_step(
 #ifndef NO_SH_REST
   for (uint k = any ? 3 * (SH_USED(coefficients) - 1) : 0; k < sh_width; ++k) own_sh_rest[k] = 0.0f;
 #endif
-  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // some items read a row that other items write
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // the gradients of sh_rest are complete
   ROLLED for (int number = 0; number < ARRAYS; ++number) { // not unrolled: the code would be six times as long
     if (number == ARRAYS - 5) {                            // sh_rest is done
       barrier(CLK_LOCAL_MEM_FENCE);

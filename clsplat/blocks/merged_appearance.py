@@ -60,7 +60,7 @@ def _mean_grids(whole: Path, names: Sequence[str], parts: Sequence[Path]) -> NDA
     for part in parts:
         some = [name for name in learnt_of(part, "grid")["photographs"] if name in places]
         at = np.array([places[name] for name in some], np.int64)
-        values = grids_of(part, some, grids.shape[1:])
+        values = grids_of(part, some)
         grids[at[counts[at] == 0]] = 0
         grids[at] += values
         counts[at] += 1

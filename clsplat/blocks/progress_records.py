@@ -66,7 +66,7 @@ def check_begun(run: Path, plan: str, start: str, advice: Callable[[], str]) -> 
         content = {"clsplat_block": RECORD_FORM, "plan": plan, "start": start}
         atomic_write(path, (json.dumps(content) + "\n").encode())
         return
-    record = _loaded(path)
+    record = _loaded(path, advice)
     for name, now, what in (("plan", plan, "by another plan"), ("start", start, "with another model")):
         if record.get(name) != now:
             raise InputError(
@@ -88,7 +88,7 @@ def done_record(run: Path) -> DoneRecord | None:
     path = run / DONE_FILE
     if not path.exists():
         return None
-    record = _loaded(path)
+    record = _loaded(path, lambda: f"move {run} away to train anew")
     files = record.get("files")
     digests = files if isinstance(files, dict) else {}
     texts = [record.get("plan"), record.get("start"), digests.get("model.ply"), *digests.values()]
@@ -99,13 +99,16 @@ def done_record(run: Path) -> DoneRecord | None:
     return DoneRecord(str(record["plan"]), str(record["start"]), digests)
 
 
-def _loaded(path: Path) -> dict[str, Any]:
-    """Return the content of a record. Raises InputError for a file that is no record, or of another form."""
+def _loaded(path: Path, advice: Callable[[], str]) -> dict[str, Any]:
+    """Return the content of a record. Raises InputError for a file that is no record, or of another form.
+
+    advice: function that returns in words how to train anew, for the message.
+    """
     record = load_document(path, _EXPECTED_RECORD, "clsplat_block")
     if (form := record.get("clsplat_block")) != RECORD_FORM:
         raise InputError(
             f"{path}: clsplat_block is {form!r:.40}, expected {RECORD_FORM}: another version of clsplat began this "
-            f"training; finish with that version, or move {path.parent} away to train anew"
+            f"training; finish with that version, or {advice()}"
         )
     return record
 

@@ -143,9 +143,10 @@ def _parsed(arguments: Sequence[str], called: type[Verb] | None) -> Verb:
     """
     # Docstrings of fields are the help. tyro would also look for comments, and tokenize the classes' sources for that.
     config = (HelptextFromCommentsOff,)
-    completing = any(word.replace("_", "-").startswith("--tyro-") for word in arguments)  # of all verbs, or none
+    # A completion script lists all verbs.
+    completing = any(word.replace("_", "-").startswith("--tyro-") for word in arguments)
     verb: Verb
-    if called is not None and not completing:  # without the other verbs, which take tyro 10 ms
+    if called is not None and not completing:  # tyro needs 10 ms for the other verbs
         verb = tyro.cli(called, args=arguments[1:], prog=f"clsplat {arguments[0]}", config=config)
     else:
         kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}

@@ -16,6 +16,10 @@ from clsplat.optimisation.density_rules import FRESH, FROZEN, UNWANTED, USELESS
 TILE = 16  # tile_size in gsplat
 """Tile size: side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
+GRID_SHAPE = (8, 16, 16, 3, 4)
+"""Size of a bilateral grid: levels, rows and columns, then the shape of the colour transform at each vertex
+(`kernels/grid.cl`)."""
+
 LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
 """Sizes of the blocks of pixels that work-groups of the loss kernel process (`kernels/loss.cl`).
 

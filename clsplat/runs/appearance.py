@@ -17,6 +17,7 @@ from clsplat.config.colour_models import COLOUR_MODELS, ColourModel
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import parse_json, read_document
 from clsplat.images.alpha import Image
+from clsplat.layouts.columns import GRID_SHAPE
 from clsplat.runs.run import APPEARANCE_FILE, Run, run_of
 
 MAX_APPEARANCE_BYTES = 1 << 28
@@ -119,22 +120,22 @@ def entries_of(folder: Path, names: Sequence[str], model: ColourModel) -> tuple[
     return tables[0], tables[1]
 
 
-def grids_of(folder: Path, names: Sequence[str], shape: tuple[int, ...] | None = None) -> Float32:
-    """Return the bilateral grids (photographs, *shape) that the run in `folder` has learnt of photographs.
+def grids_of(folder: Path, names: Sequence[str]) -> Float32:
+    """Return the bilateral grids (photographs, *GRID_SHAPE) that the run in `folder` has learnt of photographs.
 
-    names: the photographs' names.
-    shape: the expected shape of a grid; None for any.
-    Raises InputError.
+    names: the photographs' names. Raises InputError.
     """
-    record, arrays = learnt_of(folder, "grid", names), (folder / APPEARANCE_FILE).with_suffix(".npz")
+    path, record = folder / APPEARANCE_FILE, learnt_of(folder, "grid", names)
     try:
-        rows = [int(record["photographs"][name]["grid"]) for name in names]
+        rows = np.array([record["photographs"][name]["grid"] for name in names], np.uint32)
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise _misread(path, error) from None
+    arrays = path.with_suffix(".npz")
+    try:
         with np.load(arrays, allow_pickle=False) as file:
             grids = file["grids"]
-        shape = grids.shape[1:] if shape is None else shape
-        is_right = grids.shape[1:] == shape and grids.dtype == np.float32 and min(rows, default=0) >= 0
-        if not (is_right and np.isfinite(grids).all()):
-            raise ValueError(f"grids have shape {grids.shape}, expected finite float32 of (photographs, *{shape})")
+        if grids.shape[1:] != GRID_SHAPE or grids.dtype != np.float32 or not np.isfinite(grids).all():
+            raise ValueError(f"grids have shape {grids.shape}, expected finite float32 of (photographs, *{GRID_SHAPE})")
         return np.ascontiguousarray(grids[rows])
     except (ValueError, TypeError, KeyError, IndexError, OSError, BadZipFile, OverflowError) as error:
         raise _misread(arrays, error) from None

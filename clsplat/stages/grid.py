@@ -13,10 +13,9 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid, launch_items
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import GRID_SHAPE
 from clsplat.stages.appearance import APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON
 
-GRID_SHAPE = (8, 16, 16, 3, 4)
-"""Size of a bilateral grid: levels, rows and columns, then the shape of the colour transform at each vertex."""
 GRID_FLOATS = int(np.prod(GRID_SHAPE))
 
 

@@ -26,8 +26,8 @@ class Start:
     region: the region in which the training changes Gaussians. None means everywhere. `train` leaves
         pixels that show frozen Gaussians out of the loss (`training.region_masks`).
     appearance_of: folder with the appearance.json (and appearance.npz) of an earlier training, whose appearance the
-        photographs of the same names begin with. Its mean over the photographs stays, and in a region the vignettes
-        of lenses. None begins as if nothing had been learnt.
+        photographs of the same names begin with. Its mean over the photographs stays. With `region`, the
+        vignettes of lenses stay too. None begins as if nothing had been learnt.
     """
 
     model: Gaussians | None = None

@@ -148,7 +148,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     }
     for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
     __global const float *splat = splats + (size_t)SPLAT_SIZE * (first_row + lane);
-    FOR_AXES(k) { // equation (38) of docs/gradients.md: a clamped channel has no gradient
+    FOR_AXES(k) { // equation (39) of docs/gradients.md: a clamped channel has no gradient
       if (!(splat[SPLAT_RED + k] > 0.0f)) m[SLOT_RED + k].lane[lane] = 0.0f;
     }
 #ifndef RAYS

@@ -243,6 +243,15 @@ def test_a_run_of_another_plan_is_refused(done_city: Path, tmp_path: Path, defau
         assert said in refusal(lambda: train_block(city, "0,0", load(), trains_on(default_device)))
 
 
+def test_a_finish_of_another_version(done_city: Path, tmp_path: Path, default_device: Device) -> None:
+    city = shutil.copytree(done_city, tmp_path / "city")
+    (city / "done.json").unlink()
+    (city / "begun.json").write_text('{"clsplat_block": 1}')
+    said = refusal(lambda: finish(city, None, load(), trains_on(default_device)))
+    assert "another version of clsplat began this training" in said
+    assert "to train the finish anew, remove from this folder: begun.json, " in said
+
+
 def test_a_missing_photograph_is_named(
     planned_city: Path, small_scene: Path, tmp_path: Path, default_device: Device
 ) -> None:

@@ -12,6 +12,7 @@ from calls import refusal
 from compare import assert_same_bits
 
 from clsplat.blocks.merged_appearance import mean_appearance
+from clsplat.layouts.columns import GRID_SHAPE
 
 NAMES = ("a", "b", "c", "d")
 KNOWN = {"whole": NAMES, "one": ("b", "a"), "other": ("c", "b", "elsewhere")}
@@ -36,8 +37,13 @@ def write_grids(folder: Path, first: float) -> Path:
     places = {name: {"grid": place} for place, name in enumerate(KNOWN[folder.name])}
     (folder / "appearance.json").write_text(json.dumps({"kind": "grid", "photographs": places, "held_out": {}}))
     steps = np.arange(len(places), dtype=np.float32)
-    np.savez(folder / "appearance.npz", grids=np.broadcast_to(first + steps[:, None, None], (len(places), 3, 4)))
+    np.savez(folder / "appearance.npz", grids=in_grids(first + steps))
     return folder
+
+
+def in_grids(values: np.ndarray) -> np.ndarray:
+    """Grids (photographs, ...), each of one number."""
+    return np.ascontiguousarray(np.broadcast_to(values.reshape(-1, 1, 1, 1, 1, 1), (len(values), *GRID_SHAPE)))
 
 
 @pytest.mark.parametrize("kind", ["exposure", "ppisp"])
@@ -61,7 +67,22 @@ def test_grids(tmp_path: Path) -> None:
     record, tables = mean_appearance(whole, [one, other], "grid")
     assert record["photographs"] == {name: {"grid": place} for place, name in enumerate(NAMES)}
     wanted = np.array([5.0, 1.5, -2.0, 3.0], np.float32)
-    assert_same_bits(tables["grids"], np.ascontiguousarray(np.broadcast_to(wanted[:, None, None], (4, 3, 4))))
+    assert_same_bits(tables["grids"], in_grids(wanted))
+
+
+def test_damaged_grids_are_named(tmp_path: Path) -> None:
+    whole, one = (write_grids(tmp_path / name, 0) for name in ("whole", "one"))
+
+    def said() -> str:
+        return refusal(lambda: mean_appearance(whole, [one], "grid"))
+
+    np.savez(one / "appearance.npz", grids=in_grids(np.zeros(2, np.float32))[:, :-1])
+    assert f"{one / 'appearance.npz'}: ValueError: grids have shape (2, 7, 16, 16, 3, 4), expected finite" in said()
+    (one / "appearance.npz").write_bytes(b"PK")
+    assert f"{one / 'appearance.npz'}: " in said()
+    for row in ({"grid": -1}, {"grid": "b"}, 5):
+        (one / "appearance.json").write_text(json.dumps({"kind": "grid", "photographs": {"a": row}}))
+        assert f"{one / 'appearance.json'}: " in said()
 
 
 def test_a_damaged_part_is_named(tmp_path: Path) -> None:

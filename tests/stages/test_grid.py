@@ -8,10 +8,10 @@ from compare import assert_close, assert_close_gradient, assert_same_bits
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.layouts.columns import READBACK
+from clsplat.layouts.columns import GRID_SHAPE, READBACK
 from clsplat.reference import grid as reference
 from clsplat.selftest.harness import planes_of
-from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
+from clsplat.stages.grid import Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
 
 def some_grids(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -15,8 +15,8 @@ from tiny import CONFIG
 
 from clsplat.cli.main import main
 from clsplat.device.context import Device
+from clsplat.layouts.columns import GRID_SHAPE
 from clsplat.scenes.scene import Scene
-from clsplat.stages.grid import GRID_SHAPE
 from clsplat.training.trainer import Trainer
 
 WITH_GRIDS = replace(CONFIG, appearance="grid")

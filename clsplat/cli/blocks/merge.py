@@ -16,7 +16,7 @@ class BlocksMergeVerb(Verb):
     """Merge the models of all blocks into CITY/merged.ply.
 
     Each block gives the Gaussians whose means lie in its own cell. CITY/merged gets the mean appearance of each
-    photograph over the blocks but the sky's, if appearances are learnt.
+    photograph over all blocks except the sky's, if appearances are learnt.
     """
 
     city: CityFolder

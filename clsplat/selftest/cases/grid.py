@@ -10,13 +10,14 @@ from numpy.random import Generator
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
+from clsplat.layouts.columns import GRID_SHAPE
 from clsplat.reference import grid as reference
 from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.appearance import moment, random_gradient, random_moments, stepped
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
+from clsplat.stages.grid import Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
 GRID_PHOTOGRAPH = 1
 """Index of the photograph whose grid is tested; there are two photographs."""

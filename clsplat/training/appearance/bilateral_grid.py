@@ -18,8 +18,9 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
+from clsplat.layouts.columns import GRID_SHAPE
 from clsplat.runs.appearance import grids_of
-from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, device_bytes, grid_gradient, step_grid
+from clsplat.stages.grid import Grids, apply_grid, centre_grids, device_bytes, grid_gradient, step_grid
 from clsplat.training.appearance.base import Appearance
 from clsplat.training.appearance.schedule import loaded, rate_at, saved
 from clsplat.training.step.inputs import ViewPart
@@ -118,7 +119,7 @@ class GridsOfAll(Appearance):
         """
         del keeps_lenses
         names = [view.name for view in self._scene.train_views]
-        self._grids = Grids.on(self._device, grids_of(folder, names, GRID_SHAPE))
+        self._grids = Grids.on(self._device, grids_of(folder, names))
 
     @property
     def pixel_bytes(self) -> int:
