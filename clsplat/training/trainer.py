@@ -108,7 +108,6 @@ class Trainer:
         initial = self.begins_with.model or from_scene(self.scene, self.config.random_points, self.position.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
         if (earlier := self.begins_with.appearance_of) is not None:
-            # pictures that are masked but for a region do not tell a vignette from the region's own shades
             self.appearance.begin_from(earlier, keeps_lenses=self.begins_with.region is not None)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near, region = initial.origin, self.scene.near, self.begins_with.region

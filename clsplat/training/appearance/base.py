@@ -46,7 +46,8 @@ class Appearance(Component):
         """Begin with the appearance that the files in `folder` have for the photographs of the same names. Its mean
         over these photographs stays.
 
-        keeps_lenses: True if the lenses' part of the appearance is not trained.
+        keeps_lenses: True if the lenses' part of the appearance is not trained. Photographs that count in one region
+            only do not tell a vignette from the region's own shades.
         Raises InputError if the files do not have this appearance of all training photographs.
         """
 
