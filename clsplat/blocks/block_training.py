@@ -14,7 +14,7 @@ from pathlib import Path
 
 from clsplat.blocks.block_scene import scene_of_block, scene_of_finish
 from clsplat.blocks.block_settings import block_settings, finish_settings
-from clsplat.blocks.merging import is_merged, merge_digest, merged_of, region_of_block
+from clsplat.blocks.merging import is_merged, merge_digest, merged_of, records_of_blocks, region_of_block
 from clsplat.blocks.plan import BLOCKS_FOLDER, COARSE_FOLDER, Block, BlockPlan, read_plan
 from clsplat.blocks.plan_check import check_plan
 from clsplat.blocks.progress_records import (
@@ -130,7 +130,7 @@ def is_finished(city: Path, plan: BlockPlan, steps: int | None) -> bool:
     steps: number of steps that the finish must have; None for any number.
     """
     with suppress(ClsplatError):
-        merged = merge_digest(city, plan)
+        merged = merge_digest(plan, records_of_blocks(city, plan))
         return is_done(city, plan.digest, merged) and steps in (None, Run.open(city).config.iterations)
     return False
 
@@ -146,7 +146,7 @@ def _steps(city: Path, plan: BlockPlan, asked: int | None) -> int:
 
 def _merged(city: Path, plan: BlockPlan) -> str:
     """Return the digest of the merge. Raises InputError unless it has the models and the appearances of all blocks."""
-    wanted, path = merge_digest(city, plan), city / MERGED_FILE
+    wanted, path = merge_digest(plan, records_of_blocks(city, plan)), city / MERGED_FILE
     if not is_merged(city, plan):
         what = f"{path}: is missing" if not path.exists() else f"{path}: is no merge of blocks"
         with suppress(InputError):

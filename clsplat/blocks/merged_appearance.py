@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config.colour_models import COLOUR_MODELS, ColourModel
-from clsplat.runs.appearance import Row, check_appearance, grids_of, learnt_of
+from clsplat.runs.appearance import Row, entries_of, grids_of, learnt_of
 
 
 def mean_appearance(
@@ -25,8 +25,8 @@ def mean_appearance(
     Raises InputError if a file is missing or damaged.
     """
     photographs = learnt_of(whole, kind)["photographs"]
-    check_appearance(whole, kind, list(photographs))
     if kind in COLOUR_MODELS:
+        entries_of(whole, list(photographs), COLOUR_MODELS[kind])  # raises InputError for damaged rows
         rows, tables = _mean_rows(photographs, parts, COLOUR_MODELS[kind]), {}
     else:
         rows = {name: {"grid": place} for place, name in enumerate(photographs)}
@@ -40,7 +40,7 @@ def _mean_rows(photographs: dict[str, Row], parts: Sequence[Path], model: Colour
     for part in parts:
         learnt = learnt_of(part, model.stem)["photographs"]
         names = [name for name in learnt if name in found]
-        check_appearance(part, model.stem, names)
+        entries_of(part, names, model)
         for name in names:
             found[name].append(learnt[name])
     learns = [*model.of_photograph, *model.of_lens]

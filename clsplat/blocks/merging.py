@@ -93,10 +93,9 @@ def _kind(model: Gaussians) -> tuple[object, ...]:
     return model.sh_degree, tuple(model.origin.tolist()), model.near, model.antialiased, model.by_rays
 
 
-def merge_digest(city: Path, plan: BlockPlan) -> str:
-    """Return the digest of the merge of all blocks, in hexadecimal. Raises InputError, as `records_of_blocks`."""
-    results = [record.result for record in records_of_blocks(city, plan)]
-    return hashlib.sha256("\n".join([plan.digest, *results]).encode()).hexdigest()
+def merge_digest(plan: BlockPlan, records: Sequence[DoneRecord]) -> str:
+    """Return the digest of a merge, in hexadecimal. records: the blocks' records, in the plan's order."""
+    return hashlib.sha256("\n".join([plan.digest, *(record.result for record in records)]).encode()).hexdigest()
 
 
 def merge(city: Path) -> bool:
@@ -108,8 +107,9 @@ def merge(city: Path) -> bool:
     plan = read_plan(city)
     if is_merged(city, plan):
         return False
+    records = records_of_blocks(city, plan)
     folders = {block.name: city / BLOCKS_FOLDER / block.name for block in plan.blocks}
-    for folder, record in zip(folders.values(), records_of_blocks(city, plan), strict=True):
+    for folder, record in zip(folders.values(), records, strict=True):
         _check_result(folder, record)
     if plan.settings.appearance != "none":
         # not of the sky's block, as the sky alone tells little about the exposure of a photograph
@@ -118,7 +118,7 @@ def merge(city: Path) -> bool:
         (city / MERGED_APPEARANCE_FOLDER).mkdir(exist_ok=True)
         Run(city / MERGED_APPEARANCE_FOLDER, plan.settings, plan.scene).write_appearance(*found)
     models = [CellModel(folders[block.name] / "model.ply", region_of_block(plan, block)) for block in plan.blocks]
-    comments = [comment(recorded_space(models[0].path)), f"{MERGED_COMMENT} {merge_digest(city, plan)}"]
+    comments = [comment(recorded_space(models[0].path)), f"{MERGED_COMMENT} {merge_digest(plan, records)}"]
     write_merged(city / MERGED_FILE, models, comments)
     return True
 
@@ -135,9 +135,10 @@ def _check_result(folder: Path, record: DoneRecord) -> None:
 
 def is_merged(city: Path, plan: BlockPlan) -> bool:
     """True if merged.ply has the finished models of all blocks, and their merged appearance is there."""
-    learnt = Run(city / MERGED_APPEARANCE_FOLDER, plan.settings, plan.scene).result_files[1:]
+    learnt = Run(city / MERGED_APPEARANCE_FOLDER, plan.settings, plan.scene).appearance_files
     with suppress(ClsplatError):
-        return merged_of(city / MERGED_FILE) == merge_digest(city, plan) and all(file.exists() for file in learnt)
+        wanted = merge_digest(plan, records_of_blocks(city, plan))
+        return merged_of(city / MERGED_FILE) == wanted and all(file.exists() for file in learnt)
     return False
 
 

@@ -201,12 +201,15 @@ class Run:
     @property
     def result_files(self) -> list[Path]:
         """Files of the trained model and of the learnt appearance, which a finished training has written."""
-        files = [self.model_path]
-        if self.config.appearance != "none":
-            files.append(self.appearance_path)
-        if self.config.appearance == "grid":
-            files.append(self.appearance_path.with_suffix(".npz"))
-        return files
+        return [self.model_path, *self.appearance_files]
+
+    @property
+    def appearance_files(self) -> list[Path]:
+        """Files of the learnt appearance; none if the settings learn no appearance."""
+        if self.config.appearance == "none":
+            return []
+        tables = [self.appearance_path.with_suffix(".npz")] if self.config.appearance == "grid" else []
+        return [self.appearance_path, *tables]
 
     def model_record(self) -> dict[str, Any]:
         """Return a record with the `step` and `seconds` of model.ply; empty if they are not known.

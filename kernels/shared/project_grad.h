@@ -5,10 +5,10 @@
 // OWN_ROW: a work-item has copied its Gaussian's parameters, number of tiles and first slot. Its SH coefficients are in
 // local memory, and their gradients overwrite them.
 //
-// LISTED: the type, with address space, of tile_counts and first_slots. SH_COEFFICIENT: that of sh_rest. SH_GRADIENT:
-// that of its gradients, of all Gaussians (global), of those of a work-item (private) or of a group (local). OWN: the
-// index of a Gaussian's row in arrays of the types PARAMETER and LISTED. ADDENDS_AHEAD makes a GPU load four slots of a
-// Gaussian before it adds them up.
+// Types with address space: LISTED of tile_counts and first_slots, SH_COEFFICIENT of sh_rest, SH_GRADIENT of the
+// gradients of sh_rest. These are in global memory for all Gaussians, in private memory for those of a work-item, and
+// in local memory for those of a group. OWN: the index of a Gaussian's row in arrays of the types PARAMETER and LISTED.
+// ADDENDS_AHEAD makes a GPU load four slots of a Gaussian before it adds them up.
 #ifdef OWN_ROW
 #define LISTED const uint
 #define SH_COEFFICIENT __local const float

@@ -4,7 +4,7 @@
 Tests for the same driver in the same shape are a group, so that its kernels are built only once, which takes most of
 the time; each shape has builds of its own. Tests that name no shape have the driver's own. Shapes with and without a
 Gaussian per work-item share all kernels but one, and are a group. Other tests of a file are a group, because they share
-fixtures; those of the files that draw the demo's still life are one group, so that its textures are made only once.
+fixtures. All files that draw the demo's still life are one group, because each process makes its textures anew.
 Groups follow from the tests' identifiers. The marker of pytest-xdist 3.8 has no effect with pytest 9.2.
 """
 

@@ -19,8 +19,8 @@ from clsplat.cli.training_run import TrainingMachine, TrainingProgress
 class BlocksTrainVerb(Verb):
     """Train one block of a plan, as a run in CITY/blocks. The same command goes on after an interruption.
 
-    The coarse model around the block is drawn, but does not change. Refined cameras are those of the coarse model.
-    Appearances begin with the coarse model's.
+    The training draws the coarse model around the block and does not change it. It uses the cameras that the coarse
+    model has refined. Appearances begin with the coarse model's.
     """
 
     city: CityFolder

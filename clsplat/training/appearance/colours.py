@@ -208,8 +208,8 @@ class ColoursOfAll(Appearance):
         self._keeps_lenses = False
 
     def begin_from(self, folder: Path, *, keeps_lenses: bool) -> None:
-        """Begin with the entries that appearance.json in `folder` has for the photographs of the same names, and with
-        the mean of a lens's photographs. The mean of the photographs' entries stays.
+        """Begin with the entries that appearance.json in `folder` has for the photographs of the same names and for
+        their lenses. The mean of the photographs' entries stays.
 
         keeps_lenses: True if the lenses' entries are not trained.
         Raises InputError if the file does not have this colour model of all training photographs.
@@ -218,11 +218,9 @@ class ColoursOfAll(Appearance):
         own, of_lenses = entries_of(folder, [view.name for view in views], model)
         self._earlier, self._mean, self._keeps_lenses = own.astype(np.float32), own.mean(axis=0), keeps_lenses
         if self._lenses is not None:
-            lenses = np.array([taken.lens for taken in self._taken])
-            values = np.zeros((len(self._lens_rows), model.lens_entries))
-            np.add.at(values, lenses, of_lenses)
-            values /= np.maximum(np.bincount(lenses, minlength=len(values)), 1)[:, None]
-            self._lenses = Gains.on(self._device, values.astype(np.float32))
+            values = np.zeros((len(self._lens_rows), model.lens_entries), np.float32)
+            values[[taken.lens for taken in self._taken]] = of_lenses
+            self._lenses = Gains.on(self._device, values)
 
     @cached_property
     def _gains(self) -> Gains:
