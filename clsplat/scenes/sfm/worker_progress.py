@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import IO, Any
 
 from clsplat.errors import ClsplatError
-from clsplat.files.documents import is_file
 from clsplat.process import apart
 from clsplat.progress import CountedFraction, Progress
 
@@ -66,12 +65,11 @@ def run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, 
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            process.stdin.write(json.dumps(task) + "\n")
-            process.stdin.flush()
+            with contextlib.suppress(OSError):  # the worker has ended: broken pipe, or invalid argument on Windows
+                process.stdin.write(json.dumps(task) + "\n")
+                process.stdin.flush()
             answer = _follow(process.stdout, work, report)
             process.wait()
-        except OSError:  # the worker has ended: broken pipe, or invalid argument on Windows
-            answer = {}
         finally:
             process.kill()
             process.wait()
@@ -131,7 +129,8 @@ def _count(work: Path, results: str) -> int:
     Returns 0 while the table cannot be read.
     """
     if results == UNDISTORTED_IMAGES:
-        return sum(is_file(path) for path in (work / UNDISTORTED_IMAGES).rglob("*"))
+        # Not rglob, which raises FileNotFoundError where the worker removes a folder meanwhile.
+        return sum(len(files) for _, _, files in os.walk(work / UNDISTORTED_IMAGES))
     try:
         name = f"{(work / 'database.db').resolve().as_uri()}?mode=ro"
         with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:
