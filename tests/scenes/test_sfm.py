@@ -419,7 +419,7 @@ def test_photos_are_counted_while_the_worker_moves_them_away(tmp_path, monkeypat
 
     def moved_before(path):
         if Path(path).name == "b":
-            os.rename(path, tmp_path / "moved")
+            Path(path).rename(tmp_path / "moved")
         return listed(path)
 
     monkeypatch.setattr(os, "scandir", moved_before)
