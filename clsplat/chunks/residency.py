@@ -46,7 +46,8 @@ class Residency:
         self._chunk_in = np.full(slots, _NOTHING, np.int64)
         self._used = np.zeros(slots, np.int64)
         """By slot, the number of its last use; 0 if it has had no chunk."""
-        self._uses = 0
+        self.uses = 0
+        """Number of calls of `use`."""
 
     def plan(self, numbers: NDArray[np.integer[Any]]) -> Moves:
         """Plan the copies that bring the chunks `numbers` (k,) to the device, in place of the least recently used.
@@ -56,13 +57,31 @@ class Residency:
         """
         if len(numbers) > self.slots:
             raise ValueError(f"numbers: {len(numbers)} chunks, expected at most {self.slots}, the number of slots")
-        slots, used = self._slot_of[numbers], self._used.copy()
+        return self._plan(np.asarray(numbers, np.int64))
+
+    def plan_ahead(self, numbers: NDArray[np.integer[Any]], before: int) -> Moves:
+        """Plan as `plan` does, but only in place of chunks that were last used at `uses` = `before` or earlier.
+
+        If these are too few, the plan leaves out the last of the chunks that are not on the device.
+        """
+        numbers = np.asarray(numbers, np.int64)
+        there = self._slot_of[numbers] != _NOTHING
+        old = self._used <= before
+        old[self._slot_of[numbers[there]]] = False
+        return self._plan(numbers[there | (np.cumsum(~there) <= np.count_nonzero(old))])
+
+    def _plan(self, numbers: NDArray[np.int64]) -> Moves:
+        slots = self._slot_of[numbers]
         missing = slots == _NOTHING
-        used[slots[~missing]] = self._uses + 1  # chunks of this step count as used last, and are not evicted
-        to = np.sort(np.argsort(used, kind="stable")[: np.count_nonzero(missing)])
-        slots[missing] = to
+        to = np.zeros(0, np.int64)
+        if lacking := int(np.count_nonzero(missing)):
+            used = self._used.copy()
+            used[slots[~missing]] = self.uses + 1  # chunks of this step count as used last, and are not evicted
+            age = used * self.slots + np.arange(self.slots)  # of slots that were last used together, the first ones
+            to = np.sort(np.argpartition(age, lacking - 1)[:lacking])
+            slots[missing] = to
         leaving = to[self._chunk_in[to] != _NOTHING]
-        fetched = np.asarray(numbers, np.int64)[missing]
+        fetched = numbers[missing]
         by_slot = [each.astype(np.uint32) for each in (slots, to, leaving)]
         return Moves(by_slot[0], fetched, by_slot[1], self._chunk_in[leaving], by_slot[2])
 
@@ -72,9 +91,9 @@ class Residency:
 
     def use(self, moves: Moves) -> None:
         """Record that the fetched chunks of a plan are on the device, and that all chunks of the plan are used now."""
-        self._uses += 1
+        self.uses += 1
         self._slot_of[moves.fetched], self._chunk_in[moves.fetched_to] = moves.fetched_to, moves.fetched
-        self._used[moves.slots] = self._uses
+        self._used[moves.slots] = self.uses
 
     def held(self) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
         """Return the numbers of the chunks on the device, in rising order, and their slots."""

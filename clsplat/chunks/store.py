@@ -143,12 +143,13 @@ class ChunkStore:
             if writable and not kept:
                 remove(self.path)
 
-    def read(self, numbers: NDArray[np.integer[Any]]) -> NDArray[Any]:
+    def read(self, numbers: NDArray[np.integer[Any]], into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Read the records (k,) of the chunks `numbers` (k,). Rows past the end of a chunk are undefined.
 
-        Raises ScratchError if the file cannot be read, or differs from what was written.
+        into: (k,), the array for the records; None makes a new one. Raises ScratchError if the file cannot be read, or
+        differs from what was written.
         """
-        records = np.empty(len(numbers), self.record)
+        records = np.empty(len(numbers), self.record) if into is None else into
         if self.path is None:
             for place, (number, length) in enumerate(zip(numbers, self.lengths(numbers).tolist(), strict=True)):
                 if (held := self._memory[number]) is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import prod
@@ -289,15 +290,15 @@ class Hosted:
     host's memory, both arrays are in the same memory."""
 
     array: DeviceArray
-    _host: NDArray[Any]
+    host: NDArray[Any]
 
     def get(self) -> NDArray[Any]:
         """Wait for the device, and return the host array itself. It is valid until a kernel writes to `array` again."""
-        if not self._host.size:
-            return self._host
+        if not self.host.size:
+            return self.host
         if not self.array.device.shares_memory:
-            self.array.read_into(self._host)
-            return self._host
+            self.array.read_into(self.host)
+            return self.host
         device, array = self.array.device, self.array
         flags = cl.map_flags.READ
         mapped, _ = cl.enqueue_map_buffer(
@@ -306,15 +307,25 @@ class Hosted:
         mapped.base.release(device.queue)
         device.calls.blocking_reads += 1
         device.under_way.clear()
-        return self._host
+        return self.host
 
 
-def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Hosted:
-    """Allocate an array of this shape on the device and on the host. Raises CapacityError like `allocate`."""
+def hosted(
+    device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, in_pinned_memory: bool = False
+) -> Hosted:
+    """Allocate an array of this shape on the device and on the host. Raises CapacityError like `allocate`.
+
+    in_pinned_memory: True for a host array in pinned memory, if the device does not share the host's memory and there
+        is enough of it.
+    """
     kind = np.dtype(dtype)
     nbytes = prod(shape) * kind.itemsize
     if not device.shares_memory or not nbytes:
-        return Hosted(allocate(device, shape, kind), np.empty(shape, kind))
+        array = allocate(device, shape, kind)
+        if in_pinned_memory and nbytes:
+            with suppress(CapacityError):
+                return Hosted(array, pinned(device, shape, kind))
+        return Hosted(array, np.empty(shape, kind))
     memory = host_bytes(-(-nbytes // 4) * 4)
     if (word := _poison()) is not None:
         memory.view(np.uint32)[:] = word
@@ -327,11 +338,16 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
     """Allocate a host array in pinned memory, from and to which a device can copy while the host works.
 
     A copy from or to unpinned memory may make the host wait, even if the call is non-blocking.
+
+    Raises CapacityError if there is no pinned memory available.
     """
     nbytes = prod(shape) * np.dtype(dtype).itemsize
-    buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
     flags = cl.map_flags.READ | cl.map_flags.WRITE
-    host, _ = cl.enqueue_map_buffer(device.queue, buffer, flags, 0, shape, dtype, is_blocking=True)
+    try:
+        buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
+        host, _ = cl.enqueue_map_buffer(device.queue, buffer, flags, 0, shape, dtype, is_blocking=True)
+    except cl.Error as error:
+        raise CapacityError(f"{device.name}: no pinned memory available ({error})") from None
     return host  # type: ignore[no-any-return]  # the array keeps the mapping alive, and the mapping keeps the buffer
 
 

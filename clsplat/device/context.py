@@ -98,8 +98,7 @@ class Device:
         self.memory = Memory()
         self.context = cl.Context([device])
         self.profile = profile
-        properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
-        self._queue = cl.CommandQueue(self.context, device, properties)
+        self._queue = self._new_queue()
         self.calls = Calls()
         self.command_buffers: list[CommandBuffer] = []
         self.under_way: list[object] = []
@@ -182,6 +181,41 @@ class Device:
     def switched(self, *names: str) -> bool:
         """Return True if `with_switches` has set any of the defines `names`."""
         return any(name in self._switches for name in names)
+
+    def beside(self) -> Device:
+        """Copy this device, with a second in-order queue. Its commands run beside those of the first queue, except
+        where one waits for the other (`mark`, `follow`).
+
+        Returns this device itself if the driver has no second queue.
+        """
+        device = copy(self)
+        try:
+            device._queue = self._new_queue()  # noqa: SLF001  # the copy is of this class
+        except cl.Error:
+            return self
+        device.command_buffers, device.under_way = [], []
+        return device
+
+    def _new_queue(self) -> cl.CommandQueue:
+        properties = cl.command_queue_properties.PROFILING_ENABLE if self.profile else 0
+        return cl.CommandQueue(self.context, self.cl_device, properties)
+
+    def mark(self) -> cl.Event:
+        """Put a marker on the queue, and start its commands. Returns the marker's event, which is complete when all
+        commands before it are."""
+        try:
+            event = cl.enqueue_marker(self.queue)
+            self.queue.flush()
+        except cl.Error as error:
+            raise self.failed("starting its commands", error) from None
+        return event
+
+    def follow(self, event: cl.Event) -> None:
+        """Let all later commands on the queue wait for an event, which may be of another queue of this device."""
+        try:
+            cl.enqueue_barrier(self.queue, wait_for=[event])
+        except cl.Error as error:
+            raise self.failed("waiting for other commands", error) from None
 
     def with_memory_limit(self, limit: int | None) -> Device:
         """Copy this device, with the same queue and kernels. The copy's buffers may take at most `limit` bytes."""

@@ -162,6 +162,7 @@ def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]
 
 def _milliseconds(event: Any) -> float:
     try:
+        event.wait()  # it may be of another queue than the one that has finished
         return 1e-6 * float(event.profile.end - event.profile.start)
     except cl.Error:  # OpenCL has no times for a queue made without profiling
         return 0.0

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, allocate, pinned
 from clsplat.device.context import Device
-from clsplat.errors import CapacityError
 
 UPLOAD_RING_SLOTS = 3
 """Number of slots of a ring: one each for the array in use, the array that is used next, and the array that is being
@@ -42,13 +41,9 @@ class UploadRing:
     them. A new array replaces the least recently used one. Raises CapacityError if there is not enough memory."""
 
     def __init__(self, device: Device, nbytes: int) -> None:
-        self._device, self.nbytes = device, nbytes
+        self._device, self._second, self.nbytes = device, device.beside(), nbytes
         arrays = [allocate(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
-        try:
-            self._queue = cl.CommandQueue(device.context, device.cl_device)
-            hosts = [pinned(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
-        except cl.Error as error:
-            raise CapacityError(f"{device.name}: no second queue or pinned memory available ({error})") from None
+        hosts = [pinned(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
         self._slots = [_Slot(*pair) for pair in zip(arrays, hosts, strict=True)]
         """The slots, in order of their last use; the least recently used is first."""
 
@@ -59,8 +54,7 @@ class UploadRing:
         """
         if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
             return
-        done = cl.enqueue_marker(self._device.queue)
-        self._device.queue.flush()
+        done = self._device.mark()
         for slot in self._slots:
             if slot.held is not None and slot.used is None:
                 slot.used = done
@@ -72,9 +66,10 @@ class UploadRing:
         host[...] = values
         slot.held, slot.key = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype), key
         before = None if slot.used is None else [slot.used]
-        slot.arrived = cl.enqueue_copy(self._queue, slot.array.buffer, host, is_blocking=False, wait_for=before)
+        queue = self._second.queue
+        slot.arrived = cl.enqueue_copy(queue, slot.array.buffer, host, is_blocking=False, wait_for=before)
         slot.used = None
-        self._queue.flush()
+        queue.flush()
         self._device.calls.writes += 1
 
     def take(self, key: object) -> DeviceArray | None:
@@ -84,7 +79,7 @@ class UploadRing:
         """
         for slot in self._slots:
             if slot.key == key and slot.arrived is not None:
-                cl.enqueue_barrier(self._device.queue, wait_for=[slot.arrived])
+                self._device.follow(slot.arrived)
                 slot.used = None
                 self._touch(slot)
                 return slot.held

@@ -2,6 +2,7 @@
 """Copies of chunks between records and the slots of a pool: twin of kernels/chunk_records.cl.
 
 A record has all fields of a chunk one after the other. A pool has an array for each field, with a row for each slot.
+The step up to which each chunk has been caught up crosses with the records, as a field of one word.
 """
 
 from __future__ import annotations

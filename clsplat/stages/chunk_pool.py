@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pool of a streamed model's chunks on the device, which are fetched from a store and written back (launches
-chunk_records.cl)."""
+"""Pool of a streamed model's chunks on the device, which are fetched from a store and written back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from math import prod
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,50 +14,21 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.chunks.division import chunks_of
-from clsplat.chunks.residency import CROSSING_SHARE, Residency
+from clsplat.chunks.residency import CROSSING_SHARE, Moves, Residency
 from clsplat.chunks.store import ChunkStore
-from clsplat.device.buffers import DeviceArray, Workspace, allocate
+from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_items
-from clsplat.device.profile import stage
-from clsplat.errors import CapacityError
+from clsplat.errors import CapacityError, ClsplatError
 from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.stages.chunk_records import RecordCopies
 
 INVISIBLE_LOGIT = -1e9
 """Opacity logit of padding rows, which no view shows. Its square is finite, because `adam` refuses other values."""
-_VECTOR = 4
-"""Number of words of 4 bytes that a work-item of chunk_records.cl copies."""
 _MAX_CROSSING = 32
 """Maximum number of records that cross the bus at a time. More are not faster."""
 
 Cull = Callable[[Camera], NDArray[np.integer[Any]]]
 """Function that returns the chunks that a camera may show."""
-
-
-@stage("chunk_records")
-def copy_chunks(
-    device: Device,
-    slots: DeviceArray,
-    records: DeviceArray,
-    record: np.dtype[Any],
-    arrays: Mapping[str, DeviceArray],
-    *,
-    to_records: bool,
-) -> None:
-    """Copy chunks between records and the pool's arrays, field by field.
-
-    slots: (k,) uint32, the pool's slot of each record.
-    records: (k, words of a record) uint32.
-    record: type of a record (`chunks.store.record_type`).
-    arrays: the pool's arrays by field, (slots x CHUNK_ROWS, ...) float32.
-    to_records: True to copy from the arrays to the records, False to copy from the records to the arrays.
-    """
-    kernel = device.kernels("chunk_records", {"TO_RECORDS": True} if to_records else {}).copy_chunks
-    for name in record.names or ():
-        kind, offset = record.fields[name][:2]  # type: ignore[index]  # it has fields
-        words = (record.itemsize // 4, offset // 4, prod(kind.shape))
-        items = slots.shape[0] * words[2] // _VECTOR
-        launch_items(device, kernel, items, *map(np.uint64, (items, *words)), slots, records, arrays[name])
 
 
 class ChunkPool:
@@ -70,18 +41,18 @@ class ChunkPool:
     cull: function that returns the chunks that a camera may show; None if no such function is available.
     before_view: function that is called before a step with two numbers of chunks: the most that a view of the step
         shows, and those that all its views show. It may resize the pool.
+    expected: numbers of the chunks that the next step's views may show (`fetch_ahead`).
     """
 
-    def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:
-        self._device, self._work, self.store = device, work, store
+    def __init__(self, device: Device, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:
+        self._device, self.store = device, store
         self._caught = np.zeros(store.chunks, np.uint32)
-        """(chunks,), the value of `caught` of each chunk that is not on the device."""
+        """(chunks,), the value of `caught` of each chunk when it was last written back."""
         self.cull = cull
         self.before_view: Callable[[int, int], None] = lambda _chunks, _of_step: None
+        self.expected: NDArray[np.integer[Any]] = np.zeros(0, np.int64)
         self.moved_bytes = 0
         """Bytes of all records that have crossed the bus so far, in both directions."""
-        self._moved_before = 0
-        """`moved_bytes` at the latest `read_ahead`."""
         self._allocate(rows)
 
     def _allocate(self, rows: int) -> None:
@@ -94,6 +65,11 @@ class ChunkPool:
         self.caught.fill(0)
         self._residency = Residency(self.slots, self.store.chunks)
         self._changed = np.zeros(self.slots, np.bool_)
+        self._most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
+        self._copies = RecordCopies(self._device, self._most)
+        self._mark: tuple[Any, int] | None = None
+        """Event of a marker on the device's queue, and `Residency.uses` at that time. Later launches have used only the
+        slots of chunks that were placed since. None if other slots may have been used."""
 
     def resize(self, rows: int) -> None:
         """Replace the slots by empty slots for `rows` Gaussians, after writing changed chunks back. Raises WriteError.
@@ -110,6 +86,7 @@ class ChunkPool:
 
     def free(self) -> None:
         """Free the device's memory. The pool is unusable afterwards."""
+        self._copies.free()
         self.arrays.clear()
 
     def close(self) -> None:
@@ -131,28 +108,50 @@ class ChunkPool:
         unchanged, on the device and in the store.
         """
         moves = self._residency.plan(numbers)
+        if self._mark is None:
+            self._mark = self._device.mark(), self._residency.uses
         if len(moves.fetched):
-            changed = self._changed[moves.evicted_from]
-            self._write(moves.evicted[changed], moves.evicted_from[changed])
-            self._exchange_caught(moves.evicted, moves.evicted_from, moves.fetched, moves.fetched_to)
-            self._changed[moves.fetched_to] = False
-            self._residency.evict(moves)
-            self._fetch(moves.fetched, moves.fetched_to)
+            self._move(moves, self._device.mark())
+        self._copies.join()
         self._residency.use(moves)
         if changes:
             self._changed[moves.slots] = True
         return moves.slots
 
-    def read_ahead(self, camera: Camera) -> None:
-        """Begin to read, from a scratch file, the chunks that a camera may show and that are not on the device.
+    @property
+    def looks_ahead(self) -> bool:
+        """True if `fetch_ahead` uses `expected`."""
+        return self._copies.overlaps or self.store.path is not None
 
-        If no chunk has crossed the bus since the last call, nothing is read. The chunks of all views are then probably
-        on the device, and culling would take time for nothing.
+    def fetch_ahead(self) -> None:
+        """Bring the `expected` chunks to the device, while it computes the step just launched.
+
+        Only slots that this step does not use become free for them. If these are too few, or an error occurs, `place`
+        brings the rest before the next step, and raises the error. The system is asked to read all of them from a
+        scratch file already.
         """
-        if self.moved_bytes > self._moved_before and self.cull is not None and self.store.path is not None:
-            numbers = self.cull(camera)
-            self.store.read_ahead(numbers[self.slots_of(numbers) < 0])
-        self._moved_before = self.moved_bytes
+        expected, self.expected = self.expected, self.expected[:0]
+        self.store.read_ahead(expected[self._residency.slots_of(expected) < 0])
+        if self._mark is not None and self._copies.overlaps and len(expected) <= self.slots:
+            mark, uses = self._mark
+            moves = self._residency.plan_ahead(expected, uses)
+            with suppress(ClsplatError):
+                if len(moves.fetched):
+                    self._move(moves, mark)
+                self._residency.use(moves)
+        self._mark = self._device.mark(), self._residency.uses
+
+    def _move(self, moves: Moves, mark: Any) -> None:
+        """Carry out a plan's copies, after an event of the device's queue. Raises WriteError and ScratchError."""
+        self._copies.begin(mark)
+        try:
+            changed = self._changed[moves.evicted_from]
+            self._write(moves.evicted[changed], moves.evicted_from[changed])
+            self._changed[moves.fetched_to] = False
+            self._residency.evict(moves)
+            self._fetch(moves.fetched, moves.fetched_to)
+        finally:
+            self._copies.end()
 
     def place_rows(self, start: int, stop: int) -> None:
         """Copy the rows [start, stop) of the model to the first rows of the pool. They need not be whole chunks.
@@ -162,15 +161,19 @@ class ChunkPool:
         """
         self.release()
         for begin, end, slots in self._row_groups(start, stop):
-            self._to_slots(slots, self.store.get_records(begin, end))
+            rows = self.store.get_records(begin, end)
+            self._to_slots(slots, partial(_copy, rows), np.zeros(len(slots), np.uint32))
+        self._copies.end()
+        self._copies.join()
 
     def keep_rows(self, start: int, stop: int) -> None:
         """Write the rows [start, stop), which `place_rows` has copied to the pool, back to the store.
 
         Raises WriteError and ScratchError.
         """
+        self._settle()
         for begin, end, slots in self._row_groups(start, stop):
-            self.store.set_records(begin, end, self._from_slots(slots))
+            self.store.set_records(begin, end, self._from_slots(slots)[0])
 
     def _row_groups(self, start: int, stop: int) -> Iterator[tuple[int, int, NDArray[np.uint32]]]:
         """Split the rows [start, stop) into parts that cross the bus one after the other. Yields the first row of a
@@ -182,21 +185,26 @@ class ChunkPool:
 
     def write_back(self) -> None:
         """Write the chunks that have changed on the device to the store. Raises WriteError."""
+        self._settle()
         numbers, slots = self._residency.held()
         changed = self._changed[slots]
         self._write(numbers[changed], slots[changed])
         self._changed[:] = False
 
+    def _settle(self) -> None:
+        """Let copies wait for all launches, and later launches for all copies so far."""
+        self._copies.join()
+        self._copies.begin(self._device.mark())
+        self._mark = None
+
     def release(self) -> None:
         """Write changed chunks back, and empty all slots. Call it before the store changes."""
         self.write_back()
-        nothing, (numbers, slots) = np.zeros(0, np.int64), self._residency.held()
-        if len(numbers):
-            self._exchange_caught(numbers, slots, nothing, nothing.astype(np.uint32))
-            self._residency.clear()
+        self._residency.clear()
 
     def fill(self, field: str, value: float) -> None:
         """Set all elements of a field to `value`, in the slots and in the store."""
+        self._settle()
         self.arrays[field].fill(value)
         self.store.fill(field, value)
 
@@ -207,25 +215,16 @@ class ChunkPool:
 
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """Return the slots of the chunks `numbers`; -1 for a chunk that is not on the device."""
+        self._settle()  # the caller may launch kernels that use these slots
         return self._residency.slots_of(numbers)
-
-    def _exchange_caught(
-        self,
-        leaving: NDArray[np.int64],
-        leaving_from: NDArray[np.uint32],
-        coming: NDArray[np.int64],
-        coming_to: NDArray[np.uint32],
-    ) -> None:
-        caught = self.caught.get()
-        self._caught[leaving] = caught[leaving_from]
-        caught[coming_to] = self._caught[coming]
-        self.caught.set(caught)
 
     def _fetch(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
         for some in self._groups(len(numbers)):
-            values = self.store.read(numbers[some])
-            self._pad(numbers[some], values)
-            self._to_slots(slots[some], values)
+            self._to_slots(slots[some], partial(self._read, numbers[some]), self._caught[numbers[some]])
+
+    def _read(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
+        self.store.read(numbers, records)
+        self._pad(numbers, records)
 
     def _pad(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
         """Pad the records of the chunks `numbers` to CHUNK_ROWS rows, by copies of each chunk's last row. The copies'
@@ -240,31 +239,27 @@ class ChunkPool:
 
     def _write(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
         for some in self._groups(len(numbers)):
-            self.store.write(numbers[some], self._from_slots(slots[some]))
+            records, caught = self._from_slots(slots[some])
+            self.store.write(numbers[some], records)
+            self._caught[numbers[some]] = caught
 
-    def _to_slots(self, slots: NDArray[np.uint32], values: NDArray[Any]) -> None:
-        on_device, records = self._crossing(slots)
-        records.set(np.ascontiguousarray(values).view(np.uint32).reshape(records.shape))
-        copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=False)
-        self.moved_bytes += values.nbytes
+    def _to_slots(
+        self, slots: NDArray[np.uint32], read: Callable[[NDArray[Any]], None], caught: NDArray[np.uint32]
+    ) -> None:
+        self._copies.to_slots(self.store.record, slots, read, caught, self.arrays, self.caught)
+        self.moved_bytes += len(slots) * self.store.record.itemsize
 
-    def _from_slots(self, slots: NDArray[np.uint32]) -> NDArray[Any]:
-        on_device, records = self._crossing(slots)
-        copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=True)
-        values: NDArray[Any] = records.get()
-        self.moved_bytes += values.nbytes
-        return values.view(self.store.record).reshape(-1)
+    def _from_slots(self, slots: NDArray[np.uint32]) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+        self.moved_bytes += len(slots) * self.store.record.itemsize
+        return self._copies.from_slots(self.store.record, slots, self.arrays, self.caught)
 
     def _groups(self, count: int) -> list[slice]:
         """Divide `count` chunks into slices that cross the bus one after the other (`residency.CROSSING_SHARE`)."""
-        most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
-        return [slice(begin, begin + most) for begin in range(0, count, most)]
+        return [slice(begin, begin + self._most) for begin in range(0, count, self._most)]
 
-    def _crossing(self, slots: NDArray[np.uint32]) -> tuple[DeviceArray, DeviceArray]:
-        """Upload the numbers of k slots. Returns the numbers on the device, and device memory for k records."""
-        on_device = self._work.array("crossing_slots", slots.shape, np.uint32)
-        on_device.set(slots)
-        return on_device, self._work.array("crossing", (len(slots), self.store.record.itemsize // 4), np.uint32)
+
+def _copy(rows: NDArray[Any], records: NDArray[Any]) -> None:
+    records[...] = rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.camera import Camera
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, space_order
 from clsplat.chunks.store import ChunkStore, record_type
@@ -307,7 +306,7 @@ class TrainedModel:
         path, fields = self._scratch(self._record_bytes(move.coefficients) * count), self._fields(move.coefficients)
         starts = old.store.starts if old is not None and move.rows is None else None
         store = ChunkStore(count, fields, path, widest=self._widest, starts=starts)
-        make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
+        make = partial(ChunkPool, self._device, store, self.plan.rows)
         try:
             pool = make() if isinstance(source[0], HostGaussians) and old is None else None
             copied.to_store(store)
@@ -337,7 +336,7 @@ class TrainedModel:
         self._pool.free()
         self._pool = None
         self._free_models()
-        self._use(ChunkPool(self._device, self._work, store, self.plan.rows, cull), move.coefficients)
+        self._use(ChunkPool(self._device, store, self.plan.rows, cull), move.coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
         """Shape of a row of each array in a chunk's record, by name (such as "first/means").
@@ -395,7 +394,7 @@ class TrainedModel:
             return False
         self.close()
         store = ChunkStore.opened(manifest, writable=True)
-        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), coefficients)
+        self._use(ChunkPool(self._device, store, self.plan.rows), coefficients)
         return True
 
     def _use(self, pool: ChunkPool, coefficients: int) -> None:
@@ -421,10 +420,10 @@ class TrainedModel:
         """True if the model is in a scratch file, because main memory has no room for it."""
         return self.store is not None
 
-    def read_ahead(self, camera: Camera) -> None:
-        """Begin to read the chunks that a camera may show from the scratch file."""
-        assert self._pool is not None
-        self._pool.read_ahead(camera)
+    def fetch_ahead(self) -> None:
+        """Bring the chunks of a streamed model that the next step's views may show to the device."""
+        if self._pool is not None:
+            self._pool.fetch_ahead()
 
     @property
     def moved_bytes(self) -> int:

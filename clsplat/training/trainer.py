@@ -187,16 +187,15 @@ class Trainer:
             counted = (self.rasterizer, (factor, self.rasterizer), self.parameters.count)
             room = 0 if self._looks_at_steps else self.pending.room(*counted)
             result = self.pending.launch(run, room, number=self.step, reads_loss=reads_loss)
-            if self.position.queue:  # fetch the next step's photograph and Gaussians
+            if self.position.queue:  # fetch the next step's photograph
                 self.photographs.ahead(self.position.queue[-1], factor)
-                if self.model.in_file:
-                    self.model.read_ahead(self.local(self.views[self.position.queue[-1]].camera))
         else:
             of = (step(), self.model.with_moments, inputs, factor, partial(self._watched_in_batch, needs))
             result = self.batch.run(*of, statistics=needs.gradients)
             self._after_adam()
         self.position.controlled, self.position.last_views = False, views
         self._note()
+        self.model.fetch_ahead()
         if self._looks_at_steps:
             self.catch_up_exactly()
             self._rearrange(self.strategy.after_gradient(self._state()))

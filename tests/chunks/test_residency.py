@@ -85,3 +85,27 @@ def test_a_plan_changes_nothing() -> None:
 
 def test_more_chunks_than_slots() -> None:
     refuses("numbers: 3 chunks, expected at most 2", Residency(2, 5).plan, np.arange(3), error=ValueError)
+
+
+@pytest.mark.parametrize("slots", [1, 2, 5, 8])
+def test_what_was_used_since_stays(slots: int) -> None:
+    """Chunks that come ahead take the slots of others, as many as there are."""
+    rng, chunks = np.random.default_rng(slots), 8
+    residency = Residency(slots, chunks)
+    for _ in range(200):
+        before, lately = residency.uses, set()
+        for _ in range(rng.integers(3)):
+            numbers = np.sort(rng.permutation(chunks)[: rng.integers(slots + 1)])
+            place(residency, numbers.tolist())
+            lately |= set(numbers.tolist())
+        held = dict(zip(*(each.tolist() for each in residency.held()), strict=True))
+        used = {held[number] for number in lately if number in held}
+        expected = np.sort(rng.permutation(chunks)[: rng.integers(slots + 1)])
+        moves = residency.plan_ahead(expected, before)
+        missing = [number for number in expected.tolist() if number not in held]
+        others = set(range(slots)) - used - {held[number] for number in expected.tolist() if number in held}
+        assert moves.fetched.tolist() == missing[: len(others)]
+        assert set(moves.fetched_to.tolist()) <= others
+        residency.evict(moves)
+        residency.use(moves)
+        assert (residency.slots_of(moves.fetched) == moves.fetched_to).all()

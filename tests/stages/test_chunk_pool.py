@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,11 @@ import pytest
 from calls import noted, raising, refuses
 from compare import assert_same_bits
 from numpy.typing import NDArray
-from tiny import cameras
 
 from clsplat.chunks.gathering import NewValues
 from clsplat.chunks.slot_file import ScratchError
 from clsplat.chunks.store import ChunkStore
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import WriteError
 from clsplat.layouts.columns import CHUNK_ROWS
@@ -45,7 +45,15 @@ def pool_of(device: Device, model: Model, path: Path | None, slots: int = SLOTS)
     store = ChunkStore(len(model["parameters/means"]), FIELDS, path)
     for name, values in model.items():
         store.set_rows(name, 0, values)
-    return ChunkPool(device, Workspace(device), store, CHUNK_ROWS * slots)
+    return ChunkPool(device, store, CHUNK_ROWS * slots)
+
+
+@pytest.fixture(params=["the host's memory", "memory of its own"])
+def either(request: pytest.FixtureRequest, device: Device) -> Device:
+    """A device that shares the host's memory, or one that has memory of its own."""
+    one = copy(device)
+    one.shares_memory, one.under_way = request.param == "the host's memory", []
+    return one
 
 
 @pytest.fixture(params=["memory", "file"])
@@ -97,12 +105,14 @@ def change_rows(pool: ChunkPool, model: Model, start: int, by: float) -> None:
 
 
 @pytest.mark.parametrize("slots", [1, SLOTS, CHUNKS])
-def test_steps_over_some_chunks(device: Device, path: Path | None, slots: int) -> None:
+def test_steps_over_some_chunks(either: Device, path: Path | None, slots: int) -> None:
     """Random chunks come, are changed, and come back; now and then consecutive rows come, or all leave."""
     rng, model = np.random.default_rng(slots), model_of()
-    pool = pool_of(device, model, path, slots)
+    pool = pool_of(either, model, path, slots)
+    expected = np.arange(1)
     for call in range(24):
-        numbers, changes = np.sort(rng.permutation(CHUNKS)[: rng.integers(1, slots + 1)]), bool(rng.random() < 0.6)
+        numbers, changes = expected, bool(rng.random() < 0.6)
+        expected = np.sort(rng.permutation(CHUNKS)[: rng.integers(1, slots + 1)])
         if call % 6 == 5:
             change_rows(pool, model, int(rng.integers(COUNT - 1)), call)
             continue
@@ -110,6 +120,9 @@ def test_steps_over_some_chunks(device: Device, path: Path | None, slots: int) -
         assert len(set(placed.tolist())) == len(numbers)
         for chunk, slot in zip(numbers.tolist(), placed.tolist(), strict=True) if changes else ():
             change(pool, model, chunk, slot, 1 + call)
+        if call % 5 != 3:
+            pool.expected = expected
+            pool.fetch_ahead()
         if call % 9 == 8:
             pool.release()
             assert (pool.slots_of(np.arange(CHUNKS)) < 0).all()
@@ -120,11 +133,11 @@ def test_steps_over_some_chunks(device: Device, path: Path | None, slots: int) -
     assert path is None or not path.exists()
 
 
-def test_several_chunks_cross_at_once(device: Device, path: Path | None) -> None:
+def test_several_chunks_cross_at_once(either: Device, path: Path | None) -> None:
     """An eighth of the slots: 5 of 40 chunks, whose last one is not full."""
     count = 39 * CHUNK_ROWS + 1
     model = model_of(count)
-    pool = pool_of(device, model, path, slots=40)
+    pool = pool_of(either, model, path, slots=40)
     slots = pool.place(np.arange(40), changes=True)
     for chunk in (0, 7, 38, 39):
         change(pool, model, chunk, int(slots[chunk]), 1.0)
@@ -221,7 +234,7 @@ def test_rows_behind_each_chunks_last_one(device: Device, path: Path | None) -> 
     rows = np.delete(np.insert(rows, CHUNK_ROWS + 3, CHUNK_ROWS + 2 | FRESH), slice(3 * CHUNK_ROWS + 9, 4 * CHUNK_ROWS))
     pool.release()
     pool.store.move(rows, NewValues(), lambda: None)
-    pool = ChunkPool(device, Workspace(device), pool.store, CHUNK_ROWS * (CHUNKS + 1))
+    pool = ChunkPool(device, pool.store, CHUNK_ROWS * (CHUNKS + 1))
     numbers = np.arange(pool.store.chunks)
     lengths = pool.store.lengths(numbers).tolist()
     assert lengths == [1024, 512, 513, 1024, 9, 1024, 77]
@@ -242,8 +255,8 @@ def test_the_last_chunk_may_be_full(device: Device) -> None:
     check(pool, model)
 
 
-def test_the_last_caught_up_step_goes_with_a_chunk(device: Device) -> None:
-    pool = pool_of(device, model_of(), None)
+def test_the_last_caught_up_step_goes_with_a_chunk(either: Device) -> None:
+    pool = pool_of(either, model_of(), None)
     rng, wanted = np.random.default_rng(0), np.zeros(CHUNKS, np.uint32)
     for step in range(1, 30):
         numbers = np.sort(rng.permutation(CHUNKS)[: rng.integers(1, SLOTS + 1)])
@@ -286,21 +299,53 @@ def test_no_more_slots_than_chunks(device: Device) -> None:
     assert (pool.slots, pool.rows) == (CHUNKS, CHUNKS * CHUNK_ROWS)
 
 
-def test_chunks_are_read_ahead_while_chunks_come(
+def test_chunks_come_while_the_device_computes(device: Device, path: Path | None) -> None:
+    """Those that the next step may use take the slots that this step does not use, as many as there are."""
+    device, model = copy(device), model_of()
+    device.shares_memory, device.under_way = False, []
+    pool = pool_of(device, model, path)
+    record = pool.store.record.itemsize
+    steps = [([0, 1], [2, 3]), ([2, 3], [0, 1]), ([0, 1], [4, LAST]), ([4, LAST], [0, 4]), ([0, 4], [])]
+    ahead, missing = [], []
+    for number, (numbers, expected) in enumerate(steps):
+        before = pool.moved_bytes
+        slots = pool.place(np.array(numbers), changes=True)
+        missing.append((pool.moved_bytes - before) // record)
+        for chunk, slot in zip(numbers, slots.tolist(), strict=True):
+            change(pool, model, chunk, slot, 1.0 + number)
+        pool.expected, before = np.array(expected, np.int64), pool.moved_bytes
+        pool.fetch_ahead()
+        ahead.append((pool.moved_bytes - before) // record)
+        assert_same_bits(slots, pool._residency.slots_of(np.array(numbers)).astype(np.uint32), "the step's slots stay")
+    # With three slots, a step of two chunks leaves one free. In it is a chunk that has changed, but for the first step.
+    assert ahead == [1, 0, 2, 2, 0] and missing == [2, 2, 2, 2, 0]
+    check(pool, model)
+    pool.close()
+
+
+def test_an_error_ahead_is_raised_at_the_next_step(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device, model = copy(device), model_of()
+    device.shares_memory, device.under_way = False, []
+    pool = pool_of(device, model, None)
+    pool.place(np.array([0]), changes=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(pool.store, "read", raising(ScratchError("gone")))
+        pool.expected = np.array([1, 2])
+        pool.fetch_ahead()
+        refuses("gone", pool.place, np.array([1, 2]), changes=False, error=ScratchError)
+    check(pool, model)
+    pool.place(np.array([1, 2]), changes=False)
+    check(pool, model)
+
+
+def test_the_system_reads_what_has_no_slot_yet(
     default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those that a camera may show and that are not on the device; none where no chunk has come since."""
-    pool, shown = pool_of(default_device, model_of(), tmp_path / "model.chunks"), np.array([1, 2, 4])
+    pool = pool_of(default_device, model_of(), tmp_path / "model.chunks")
     asked: list[list[int]] = []
     noted(monkeypatch, ChunkStore, "read_ahead", lambda _, numbers: asked.append(numbers.tolist()))
-    camera = cameras()[0]
-    pool.place(np.array([2, 3]), changes=False)
-    pool.read_ahead(camera)
-    assert asked == [], "it is not known yet what a camera shows"
-    pool.cull = lambda _: shown
-    pool.place(np.array([3, 5]), changes=False)
-    pool.read_ahead(camera)
-    pool.place(np.array([2, 5]), changes=False)
-    pool.read_ahead(camera)
-    assert asked == [[1, 4]]
+    pool.place(np.array([1, 2, 3]), changes=False)
+    pool.expected = np.array([2, 4, LAST])
+    pool.fetch_ahead()
+    assert asked == [[4, LAST]] and (pool.slots_of(np.array([4, LAST])) < 0).all()
     pool.close()

@@ -15,7 +15,7 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
-from clsplat.stages.chunk_pool import copy_chunks
+from clsplat.stages.chunk_records import copy_chunks
 
 SIZES = [(count, coefficients) for count in (1, 2, 33) for coefficients in (1, 4, 16)]
 """Numbers of chunks and of SH coefficients: `sh_rest` has 0, 3 or 15 of them."""
@@ -54,19 +54,27 @@ def test_both_ways(device: Device, size: tuple[int, int]) -> None:
     slots = rng.permutation(count + SPARE)[:count].astype(np.uint32)
     rows = (CHUNK_ROWS * slots[:, None] + np.arange(CHUNK_ROWS)).astype(np.int64)
 
-    words = (count, record.itemsize // 4)
-    from_pool, on_device = upload(device, np.zeros(words, np.uint32)), upload(device, slots)
-    copy_chunks(device, on_device, from_pool, record, arrays, to_records=True)
-    read = from_pool.get().view(record).reshape(-1)
+    words = count * record.itemsize // 4
+    steps = rng.integers(0, 1 << 32, count + SPARE, dtype=np.uint32)
+    from_pool, on_device, caught = (
+        upload(device, np.zeros(words + count, np.uint32)),
+        upload(device, slots),
+        upload(device, steps),
+    )
+    copy_chunks(device, on_device, from_pool, record, arrays, caught, to_records=True)
+    read = from_pool.get()[:words].view(record)
+    assert from_pool.get()[words:].tolist() == steps[slots].tolist()
     assert record.names is not None
     for name in record.names:
         assert (bits(read[name]) == bits(held[name][rows])).all(), name
         assert (bits(arrays[name].get()) == bits(held[name])).all(), "a copy to records changes the pool"
 
-    given = any_bits(rng, words).view(np.uint32)
-    copy_chunks(device, on_device, upload(device, given), record, arrays, to_records=False)
+    given = any_bits(rng, (words + count,)).view(np.uint32)
+    copy_chunks(device, on_device, upload(device, given), record, arrays, caught, to_records=False)
+    steps[slots] = given[words:]
+    assert caught.get().tolist() == steps.tolist()
     for name in record.names:
-        held[name][rows] = given.view(record).reshape(-1)[name]
+        held[name][rows] = given[:words].view(record)[name]
         assert (bits(arrays[name].get()) == bits(held[name])).all(), name
 
 
@@ -80,9 +88,10 @@ def test_a_field_without_elements_is_no_part_of_a_record(device: Device) -> None
     copy_chunks(
         device,
         upload(device, np.zeros(1, np.uint32)),
-        upload(device, np.zeros((1, record.itemsize // 4), np.uint32)),
+        upload(device, np.zeros(record.itemsize // 4 + 1, np.uint32)),
         record,
         arrays,
+        upload(device, np.zeros(1, np.uint32)),
         to_records=True,
     )
-    assert device.calls.launches - before == 5
+    assert device.calls.launches - before == 5 + 1, "five fields, and the steps that chunks have been caught up to"

@@ -73,7 +73,7 @@ class Model:
         self.whole: Models = tuple(to_device(device, each) for each in host)
         store = ChunkStore(COUNT, fields_of(9) | statistics_fields(contributions=True))
         CopiedRows(by_field(host), values=new_values()).to_store(store)
-        self.pool = ChunkPool(device, self.work, store, slots * CHUNK_ROWS)
+        self.pool = ChunkPool(device, store, slots * CHUNK_ROWS)
         self.streamed: tuple[HostGaussians, ...] = pooled(self.pool, 9)
         self.chunks = send_chunks(self.work, "chunks", LISTED, COUNT)
 

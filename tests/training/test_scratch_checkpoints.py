@@ -32,7 +32,7 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.runs.checkpoints import Checkpoint, read_manifest
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.stages import chunk_pool
+from clsplat.stages import chunk_records
 from clsplat.training.memory import HostMemory
 from clsplat.training.trainer import Trainer
 
@@ -279,15 +279,15 @@ def test_a_move_that_fails_leaves_no_wrong_checkpoint(
     go: Train, whole: Callable[[TrainConfig], bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """What is where on the device is still known, so that its checkpoint has every row."""
-    wanted, real = whole(STEADY), chunk_pool.copy_chunks
+    wanted, real = whole(STEADY), chunk_records.copy_chunks
 
     def fail(trainer: Trainer) -> None:
         if trainer.step == 10:
-            monkeypatch.setattr(chunk_pool, "copy_chunks", failed)
+            monkeypatch.setattr(chunk_records, "copy_chunks", failed)
 
     def failed(*arguments: Any, to_records: bool) -> None:
         if not to_records:
-            monkeypatch.setattr(chunk_pool, "copy_chunks", real)
+            monkeypatch.setattr(chunk_records, "copy_chunks", real)
             raise CapacityError("there is no memory left")
         real(*arguments, to_records=to_records)
 

@@ -24,6 +24,7 @@ from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds
 from clsplat.chunks.culling import PictureBorders
 from clsplat.chunks.order import beside_parents, space_order
+from clsplat.chunks.residency import Residency
 from clsplat.chunks.store import ChunkStore
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
@@ -153,11 +154,12 @@ def test_the_bytes_of_the_whole_model(
 LIMITS = {
     "device 4 MiB": (4 << 20, None),
     "device 7 MiB": (7 << 20, None),
+    "device 6.5 MiB, memory of its own": (13 << 19, None),
     "host 1 MiB": (None, 1 << 20),
     "host 5 MiB": (None, 5 << 20),
 }
-"""Limits of memory, of the device and of the host, at which the pool has room for 3, 6, 1 and 7 of the 12 chunks; 6 are
-in view. A host limit puts the chunks into a file."""
+"""Limits of memory, of the device and of the host, at which the pool has room for 3, 6, 5, 1 and 7 of the 12 chunks;
+6 are in view. A host limit puts the chunks into a file. A device with memory of its own fetches chunks ahead."""
 
 
 @pytest.mark.parametrize("optimiser", quick(["dense", "sparse"], "dense"))
@@ -170,11 +172,16 @@ def test_a_streamed_model(
     wanted = whole_state(of_whole, scene, optimiser, default_device)
     of_device, of_host = LIMITS[name]
     device = default_device if of_device is None else open_device(memory_limit=of_device)
+    if name == "device 6.5 MiB, memory of its own":
+        device.shares_memory = False
     memory = HostMemory(limit=of_host, scratch=tmp_path, owner="test")
     placed: list[int] = []
+    ahead: list[bool] = []
     with pytest.MonkeyPatch.context() as patch:
         noted(patch, ChunkPool, "place", lambda _, numbers, **__: placed.append(len(numbers)))
+        noted(patch, Residency, "plan_ahead", lambda *_: ahead.append(True))
         got, trainer = trained(scene, SETTINGS[optimiser], device, 32, memory=memory)
+    assert bool(ahead) != device.shares_memory
     assert trainer.plan.streamed
     assert min(shares) < 1, "some steps leave chunks out"
     assert 0 < max(placed) <= trainer.plan.rows // CHUNK_ROWS < trainer.parameters.count / CHUNK_ROWS

@@ -195,6 +195,7 @@ def main(argv: Sequence[str]) -> int:
     print(
         f"{count:,} Gaussians of degree {arguments.degree}, {'dense' if arguments.dense else 'sparse'} Adam, "
         f"{arguments.steps} steps: {times['median_ms']:.2f} ms a step (median), {times['mean_ms']:.2f} (mean), "
+        f"{times['later_ms']:.2f} (mean of the second half), "
         f"{times['processor_ms']:.0f} of all threads (median), "
         f"{moved / arguments.steps / 2**20:.0f} MiB moved a step, {between / arguments.steps / 2**20:.0f} MiB between "
         f"devices, {made:.0f} s to begin, {caught:.0f} s to catch up, "

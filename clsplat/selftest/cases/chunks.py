@@ -30,7 +30,7 @@ from clsplat.stages.adam import AdamStep, adam, add_view
 from clsplat.stages.bounds import bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkList, padded_chunks
-from clsplat.stages.chunk_pool import copy_chunks
+from clsplat.stages.chunk_records import copy_chunks
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
@@ -414,6 +414,8 @@ def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficient
         record=record,
         slots=slots.astype(np.uint32),
         records=np.resize(words[::-1], (count, width)),
+        caught=np.resize(words, of_pool),
+        steps=np.resize(words[::-1], count),
         pool={name: np.ascontiguousarray(held[name]) for name in record.names or ()},
     )
 
@@ -439,24 +441,31 @@ def _words_of(fields: Mapping[str, Array]) -> dict[str, NDArray[np.uint32]]:
 
 def _launch_records(device: Device, _: Workspace, given: Inputs) -> Read:
     """Copy chunks from the slots to records, then other records to the slots."""
-    slots, read = upload(device, given.slots), upload(device, np.zeros_like(given.records))
-    arrays = {name: upload(device, values) for name, values in given.pool.items()}
-    copy_chunks(device, slots, read, given.record, arrays, to_records=True)
-    copy_chunks(device, slots, upload(device, given.records), given.record, arrays, to_records=False)
+    crossing = np.concatenate([given.records.reshape(-1), given.steps])
+    slots, read = upload(device, given.slots), upload(device, np.zeros_like(crossing))
+    arrays, caught = {name: upload(device, values) for name, values in given.pool.items()}, upload(device, given.caught)
+    copy_chunks(device, slots, read, given.record, arrays, caught, to_records=True)
+    copy_chunks(device, slots, upload(device, crossing), given.record, arrays, caught, to_records=False)
 
     def after() -> Arrays:
         words = _words_of({name: array.get() for name, array in arrays.items()})
-        return {"records": read.get(), "pool": np.hstack(list(words.values()))}
+        records, steps = np.split(read.get(), [given.records.size])
+        in_slots = {"pool": np.hstack(list(words.values())), "caught": caught.get()}
+        return {"records": records.reshape(given.records.shape), "steps": steps, **in_slots}
 
     return after
 
 
 def _twin_of_records(given: Inputs, _: Arrays) -> dict[str, Expected]:
-    before = _words_of(given.pool)
-    after = to_slots(given.slots, given.records, before)
+    before = _words_of(given.pool) | {"caught": given.caught[:, None]}
+    *records, steps = np.hsplit(to_records(given.slots, before), [given.records.shape[1]])
+    after = to_slots(given.slots, np.column_stack([given.records, given.steps]), before)
+    caught = after.pop("caught")
     return {
-        "records": exactly(to_records(given.slots, before)),
+        "records": exactly(records[0]),
+        "steps": exactly(steps[:, 0]),
         "pool": exactly(np.hstack(list(after.values()))),
+        "caught": exactly(caught[:, 0]),
     }
 
 

@@ -19,7 +19,8 @@ from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
-from clsplat.stages.chunk_pool import ChunkPool, copy_chunks
+from clsplat.stages.chunk_pool import ChunkPool
+from clsplat.stages.chunk_records import copy_chunks
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,

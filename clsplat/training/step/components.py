@@ -23,7 +23,7 @@ def components_of(
     region: TrainedRegion | None,
     count: int,
     unit: float,
-    next_cameras: Callable[[], Sequence[Camera]],
+    next_cameras: Callable[[bool], Sequence[Camera]],
 ) -> tuple[Component, ...]:
     """Make the components for Gaussians, and return them in order with the others.
 
@@ -32,7 +32,8 @@ def components_of(
     region: the region of the training, in the coordinates of the model; None for everywhere.
     count: number of Gaussians at the start.
     unit: the scene's length unit.
-    next_cameras: function that returns the cameras of the next step's views, as far as they are known.
+    next_cameras: function that returns the cameras of the next step's views, as far as they are known
+        (`VisibleChunks`).
     """
     late = [LateAdam(config.optimiser, rasterizer, count)] if config.optimiser.late else []
     mip_filter = MipFilter(config, rasterizer.device, rasterizer.work, cameras, region)

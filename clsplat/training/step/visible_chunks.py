@@ -105,7 +105,8 @@ class VisibleChunks(Component):
 
     unit: the scene's length unit.
     count: number of Gaussians.
-    next_cameras: function that returns the cameras of the next step's views, as far as they are known.
+    next_cameras: function that returns the cameras of the next step's views, as far as they are known. With the
+        argument True it also returns cameras whose picture may get another size.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class VisibleChunks(Component):
         rasterizer: Rasterizer,
         unit: float,
         count: int,
-        next_cameras: Callable[[], Sequence[Camera]],
+        next_cameras: Callable[[bool], Sequence[Camera]],
     ) -> None:
         self._config, self._rasterizer, self._unit, self._next_cameras = config, rasterizer, unit, next_cameras
         self._optimiser = scaled(config.optimiser, config.batch)
@@ -248,18 +249,21 @@ class VisibleChunks(Component):
             for each, found in zip(inputs, by_view, strict=True)
         ]
 
-    def after_adam(self, gaussians: AnyGaussians) -> None:  # noqa: ARG002
+    def after_adam(self, gaussians: AnyGaussians) -> None:
         """Find the chunks that the next step's views may show, while the device still computes the step just launched.
 
         Before the next step, limits of movement may shrink and bounds may be measured. The chunks found here may then
         be more than that step needs, which changes no bit of its result.
         """
-        cameras, step = self._next_cameras(), self.step + 1
+        pool = gaussians.pool if isinstance(gaussians, HostGaussians) else None
+        cameras, step = self._next_cameras(pool is not None and pool.looks_ahead), self.step + 1
         self._ahead.clear()
         if cameras and self._count > ORDERED_ROWS and self._since is not None:
             hidden = self._hidden_movement(step)
             for camera in cameras:
                 self._ahead[camera, step, self._found] = self._shown(camera, step, *hidden)
+            if pool is not None:
+                pool.expected = np.unique(np.concatenate(list(self._ahead.values())))
 
     def in_view(self, camera: Camera) -> NDArray[np.uint32]:
         """Numbers of the chunks that a camera may show after the last step."""

@@ -51,14 +51,18 @@ class ViewLoader:
             self._cameras[view] = now, camera
         return camera
 
-    def next_cameras(self, position: Position) -> list[Camera]:
+    def next_cameras(self, position: Position, any_size: bool) -> list[Camera]:
         """Cameras of the next step's views, the objects that `inputs` will give them, as far as they are known.
 
         They are other objects if the photographs' size or a refined camera changes before that step. Views of the next
         epoch are not known yet, and neither are cameras in the first epoch, because sizes are not known.
+
+        any_size: True to return in the first epoch the scene's cameras, whose size may differ.
         """
         views = position.queue[: -1 - self._config.batch : -1]
-        return [self._cameras[view][1] for view in views if view in self._cameras]
+        known = {view: self._cameras[view][1] for view in views if view in self._cameras}
+        of_scene = {view: self._local(self._refined(view)) for view in views if any_size and view not in known}
+        return [*(known | of_scene).values()]
 
     def inputs(self, view: int, position: Position, place: int, *, begins: bool) -> ViewInputs:
         """Inputs of a view, at the size of the current step.
