@@ -10,12 +10,13 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from clsplat.device.buffers import Workspace, allocate, upload
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.layouts.columns import READBACK, SPLAT, TILE
 from clsplat.reference.append import lists_of
 from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
+from clsplat.selftest.cases.list_counts import upload_list_counts
 from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import keys
 from clsplat.stages.append import append
@@ -178,6 +179,23 @@ def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.in
     ]
 
 
+def projected_boxes(
+    device: Device,
+    boxes: NDArray[np.int64],
+    depths: NDArray[np.float32],
+    tiles: tuple[int, int],
+    tile_counts: DeviceArray,
+) -> Projected:
+    """Upload what the projection would make of the Gaussians with these boxes of tiles: splats and list counts.
+
+    tiles: numbers of tiles across and down.
+    tile_counts: (n,), the number of tiles of each box.
+    """
+    pairs = np.concatenate([np.zeros(0, np.int64), *tiles_of_boxes(boxes, tiles[0])])
+    list_counts = upload_list_counts(device, tile_counts.get(), pairs, tiles[0] * tiles[1])
+    return Projected(upload(device, splats_of_boxes(boxes, depths)), tile_counts, list_counts=list_counts)
+
+
 def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.int64]:
     """Random boxes (count, 4) of tiles, with x0, x1, y0 and y1 each. tiles: numbers of tiles across and down.
 
@@ -225,10 +243,9 @@ def _frozen_boxes(bench: CaseBench) -> list[Inputs]:
 
 
 def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
-    splats, counts = splats_of_boxes(given.boxes, given.depths), upload(device, given.counts)
-    readback, host = fresh_readback(device), np.zeros(len(READBACK), np.uint32)
-    numbers = (given.tiles, readback, given.capacity, host)
-    totals, lists = append(device, work, Projected(upload(device, splats), counts), *numbers)
+    counts, readback, host = upload(device, given.counts), fresh_readback(device), np.zeros(len(READBACK), np.uint32)
+    projected = projected_boxes(device, given.boxes, given.depths, given.tiles, counts)
+    totals, lists = append(device, work, projected, given.tiles, readback, given.capacity, host)
 
     def read() -> Arrays:
         assert totals.arriving is not None

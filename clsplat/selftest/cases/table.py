@@ -12,6 +12,7 @@ from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.grid import GRID_CASE
 from clsplat.selftest.cases.library import HARMONICS_CASE, SPLATS_CASE, of_ewa, of_values
+from clsplat.selftest.cases.list_counts import LIST_COUNTS_CASE
 from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE, of_depth
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
@@ -25,6 +26,7 @@ CASES: dict[str, Case] = {
     "sort": SORT_CASE,
     "bitonic sort": BITONIC_CASE,
     "scan": SCAN_CASE,
+    "list_counts": LIST_COUNTS_CASE,
     "append": APPEND_CASE,
     "loss": LOSS_CASE,
     "masks": MASKS_CASE,
