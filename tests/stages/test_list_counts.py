@@ -22,7 +22,7 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.dropout import Thinning
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.selftest.case import faults
-from clsplat.selftest.cases.list_counts import LIST_COUNTS_CASE, expected_list_counts, read_list_counts
+from clsplat.selftest.cases.primitives import LIST_COUNTS_CASE, expected_list_counts, read_list_counts
 from clsplat.stages.chunk_lists import ChunkList, padded_chunks
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import upload_gaussians
