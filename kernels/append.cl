@@ -2,12 +2,14 @@
 // tiles, in any order. A group then sorts a tile's list by (depth, slot). Slots follow the order of the Gaussians. So
 // the lists have the same order as those of duplicate.cl and ranges.cl: by depth, then by the Gaussian's index.
 //
-// Owner: In count_tiles and append_pairs a work-item owns a Gaussian; the items of a group share a Gaussian whose box
-//   of tiles is large. In list_offsets one group owns all tiles, and a second group owns the array `sums`. In
-//   sort_lists a group owns a tile.
-// Launch: count_tiles and append_pairs: one work-item for each Gaussian, in groups of ITEMS; list_offsets: two groups;
-//   sort_lists: one group for each tile.
-// Buffers: splats (n, SPLAT_SIZE): in pixels, depth in world units. tile_counts (n).
+// Owner: In append_pairs a work-item owns a Gaussian; the items of a group share a Gaussian whose box of tiles is
+// large.
+//   In list_offsets one group owns all tiles, and a second group owns the array `sums`. In sort_lists a group owns a
+//   tile.
+// Launch: append_pairs: one work-item for each Gaussian, in groups of ITEMS; list_offsets: two groups; sort_lists: one
+//   group for each tile.
+// Buffers: splats (n, SPLAT_SIZE): in pixels, depth in world units. tile_counts (n). counts, slots and sums: of the
+//   projection (`lengths`, slots and sums in shared/list_counts.h).
 //   -> slots (n): each Gaussian's first slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted,
 //     slot_from_sorted (pairs): the lists.
 //   The other shapes are above each kernel.
@@ -15,14 +17,11 @@
 #include "shared/math.h"
 #include "shared/group.h"
 #include "shared/tile.h"
+#include "shared/list_counts.h"
 
-// Number of tiles in the largest box that an item processes alone.
-#define OWN_BOX 32
 // Number of loads that an item starts before it waits for the first.
 #define AHEAD 4
 #define EACH_AHEAD(i) _Pragma("unroll") for (uint i = 0; i < AHEAD; ++i)
-// Number of items that share a row of tiles of a wide box.
-#define SIDE (ITEMS < 8 ? ITEMS : 8)
 
 // A pair of a tile and a Gaussian: .x is its slot, .y the bits of its depth. Lists are sorted by depth, then by slot.
 typedef uint2 Pair;
@@ -105,54 +104,7 @@ static inline void store_pairs(__global Pair *list, uint count, __local const Pa
   BARRIER_LOCAL();
 }
 
-// Counts the pairs of each tile and of each group of Gaussians. tile_counts, shown (n) -> counts (tiles + 1), zeroed
-// before: the length of each tile's list, then the number of visible Gaussians; slots (n): the number of pairs of
-// earlier Gaussians in the same group; sums (groups): the number of all pairs of a group. Integer sums do not depend on
-// the order of the atomics.
-GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles_y, __global const uint *shown,
-                                __global const uint *tile_counts, __global const float *splats, __global uint *counts,
-                                __global uint *slots, __global uint *sums) {
-  __local uint scratch[ITEMS], wide[ITEMS], wides, visible;
-  const uint i = get_global_id(0), item = get_local_id(0);
-  const uint count = i < n ? tile_counts[i] : 0;
-  uint pairs;
-  if (item == 0) wides = visible = 0;
-  const uint before = group_exclusive_scan(count, scratch, &pairs);
-  BARRIER_LOCAL();
-  if (i < n) slots[i] = before;
-  if (i < n && shown[i] != 0) atomic_inc(&visible);
-  if (count > 0) {
-    const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
-    if (e.box > OWN_BOX) {
-      wide[atomic_inc(&wides)] = i;
-    } else {
-      for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
-        for (int part = 0; part < SPANS; ++part) {
-          int x0, x1;
-          tile_span(&e, ty, part, tiles_x, &x0, &x1);
-          for (int tx = x0; tx < x1; ++tx) atomic_inc(counts + ty * tiles_x + tx);
-        }
-      }
-    }
-  }
-  BARRIER_LOCAL();
-  for (uint k = 0; k < wides; ++k) {
-    const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * wide[k], tiles_x, tiles_y);
-    for (int row = e.tile_y0 + (int)item / SIDE; row < e.tile_y1; row += ITEMS / SIDE) {
-      for (int part = 0; part < SPANS; ++part) {
-        int x0, x1;
-        tile_span(&e, row, part, tiles_x, &x0, &x1);
-        for (int tx = x0 + (int)item % SIDE; tx < x1; tx += SIDE) atomic_inc(counts + row * tiles_x + tx);
-      }
-    }
-  }
-  if (item == 0) {
-    sums[get_group_id(0)] = pairs;
-    atomic_add(counts + tiles_x * tiles_y, visible);
-  }
-}
-
-// Computes where each tile's list begins. counts (tiles + 1), sums (groups) of count_tiles -> counts: the index at
+// Computes where each tile's list begins. counts (tiles + 1), sums (groups) of the projection -> counts: the index at
 // which each list begins; sums: the exclusive scan of `sums`; ranges (tiles, 2); order (tiles): the tiles sorted by
 // floor(log2) of their lists' lengths, longest first, because these take longest to sort.
 //
@@ -224,9 +176,9 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
   }
 
 // Appends every Gaussian to the lists of its tiles. sums (groups) and cursors (tiles), which are the `sums` and
-// `counts` of list_offsets; slots (n) of count_tiles -> slots (n): each Gaussian's first slot; pairs (pairs): slot and
-// depth, grouped by tile, in any order within a tile; gaussian_from_slot (pairs). In a stopped pass, tile_counts (n)
-// become zero, so that the pass adds nothing to statistics.
+// `counts` of list_offsets; slots (n) of the projection -> slots (n): each Gaussian's first slot; pairs (pairs): slot
+// and depth, grouped by tile, in any order within a tile; gaussian_from_slot (pairs). In a stopped pass, tile_counts
+// (n) become zero, so that the pass adds nothing to statistics.
 GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tiles_y, __global const float *splats,
                                  __global const uint *sums, __global const uint *readback, __global uint *cursors,
                                  __global uint *tile_counts, __global uint *slots, __global Pair *pairs,

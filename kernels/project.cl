@@ -2,7 +2,8 @@
 //
 // Owner: A work-item owns LANES Gaussians. It projects in vectors, and computes tiles and colours one visible Gaussian
 //   at a time. RasterizerConfig.extent sets how far a Gaussian reaches (shared/tile.h).
-// Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
+// Launch: One work-item for each LANES Gaussians, in groups of 64, or of ITEMS with COUNTS_LISTS; work-items past the
+//   end do nothing.
 // Buffers: means (n, 3): in world units. quaternions (n, 4): w x y z. log_scales (n, 3). opacity_logits (n). sh_dc (n,
 //     3). sh_rest (n, coefficients - 1, 3).
 //   sh_degrees (n), with SH_DEGREES: the highest SH degree that each Gaussian uses.
@@ -10,14 +11,14 @@
 //   shown (n), with NO_FRUSTUM_CULL: 1 where a splat is written, including Gaussians without a tile.
 //   THINNED leaves out each Gaussian whose random word is under `threshold`, and multiplies the opacities of the others
 //     by `factor`. model_row: the first Gaussian's row in the model; key0, key1: the step's random key.
-//   CHUNKS and FIRST_ROWS: see shared/chunks.h.
+//   CHUNKS and FIRST_ROWS: see shared/chunks.h. COUNTS_LISTS, for LANES == 1: see shared/list_counts.h.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
+#include "shared/tile.h"
+#include "shared/list_counts.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
-#include "shared/splat.h"
-#include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 #include "shared/chunks.h"
@@ -46,12 +47,13 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
                       __global const uint *first_rows
 #endif
 #endif
-                          CHUNK_PARAMETERS) {
+                          CHUNK_PARAMETERS COUNT_PARAMETERS) {
+  BEGIN_COUNTS
 #ifdef CHUNKS
   const uint first = get_global_id(0) * LANES;
-  if (first >= n) return;
+  if (first >= n) LEAVE;
   // n is a whole number of chunks, so no vector reaches past n.
-  for (uint lane = 0; lane < LANES; ++lane) tile_counts[first + lane] = 0;
+  for (uint lane = 0; lane < LANES; ++lane) SET_TILE_COUNT(first + lane, 0);
   const long ahead = rows_ahead(chunks, first);
   const uint end = end_of_rows(first, n, ahead, model_rows);
   MOVE_ROWS(ahead, )
@@ -59,12 +61,12 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   const uint end = n;
 #endif
   ROWS_OF_ITEM(end)
-  for (uint lane = 0; lane < lanes_used; ++lane) tile_counts[first_row + lane] = 0;
+  for (uint lane = 0; lane < lanes_used; ++lane) SET_TILE_COUNT(first_row + lane, 0);
 #ifdef NO_FRUSTUM_CULL
   for (uint lane = 0; lane < lanes_used; ++lane) shown[first_row + lane] = 0;
 #endif
   Projection p;
-  if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
+  if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) LEAVE;
 #ifdef ANTIALIASED
   floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0)) * compensation(p.det0, p.det);
 #else
@@ -81,7 +83,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   const intL seen = (length > 0.0f) & (length < FARTHEST);
   IntLanes valid;
   valid.all = p.valid & (opacity > ALPHA_MIN) & seen;
-  if (!ANYL(valid.all)) return;
+  if (!ANYL(valid.all)) LEAVE;
 
   Lanes field[SPLAT_SIZE];
   image_position(p.x, p.lx, p.z, p.lz, camera[CAMERA_FX], camera[CAMERA_FX_LOW], camera[CAMERA_CX],
@@ -120,12 +122,12 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #else
     if (count == 0) continue;
 #endif
-    tile_counts[i] = count;
+    SET_TILE_COUNT(i, count);
     const float4 colour = sh_colour(basis, lane, SH_OF_GAUSSIAN(i, coefficients), coefficients, sh_dc + 3 * i,
                                     sh_rest + 3 * (coefficients - 1) * i);
 #ifndef UNGUARDED
     if (!colour_is_drawn(colour)) {
-      tile_counts[i] = 0;
+      SET_TILE_COUNT(i, 0);
 #ifdef NO_FRUSTUM_CULL
       shown[i] = 0;
 #endif
@@ -133,5 +135,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     }
 #endif
     store_colour(colour, splat + SPLAT_RED);
+    KEEP_ELLIPSE(e);
   }
+  COUNT_LISTS
 }

@@ -3,16 +3,19 @@
 // special case.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
-// Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
+// Launch: One work-item for each Gaussian, in groups of 64, or of ITEMS with COUNTS_LISTS; work-items past the end do
+//   nothing.
 // Buffers: The inputs of project.cl, without NO_FRUSTUM_CULL -> splats (n, RAY_SIZE), with directions in the camera's
-//   axes and distances in world units; tile_counts (n). CHUNKS and FIRST_ROWS: see shared/chunks.h.
+//   axes and distances in world units; tile_counts (n). CHUNKS and FIRST_ROWS: see shared/chunks.h. COUNTS_LISTS: see
+//   shared/list_counts.h.
 // Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #define NEEDS_TANGENTS
 #define NEEDS_BOXES
+#include "shared/tile.h"
+#include "shared/list_counts.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
-#include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 #include "shared/rays.h"
@@ -76,25 +79,27 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
                            __global const uint *first_rows
 #endif
 #endif
-                               CHUNK_PARAMETERS) {
+                               CHUNK_PARAMETERS COUNT_PARAMETERS) {
+  BEGIN_COUNTS
+  const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
   const size_t i = get_global_id(0);
-  if (i >= n) return;
-  tile_counts[i] = 0;
+  if (i >= n) LEAVE;
+  SET_TILE_COUNT(i, 0);
 #ifdef CHUNKS
   const long ahead = rows_ahead(chunks, i);
-  if (i + ahead >= model_rows) return;
+  if (i + ahead >= model_rows) LEAVE;
   MOVE_ROWS(ahead, )
 #endif
   float opacity = sigmoidL(opacity_logits[i]);
 #ifdef THINNED
   opacity *= thinning((uint)ROW_NUMBER(i) + model_row, key0, key1, threshold, factor);
 #endif
-  if (!(opacity > ALPHA_MIN)) return;
+  if (!(opacity > ALPHA_MIN)) LEAVE;
   RayProjection p;
-  if (!project_ray(i, means, quaternions, log_scales, camera, &p)) return;
+  if (!project_ray(i, means, quaternions, log_scales, camera, &p)) LEAVE;
 #ifdef ANTIALIASED
   opacity *= compensation(p.det0, p.det);
-  if (!(opacity > ALPHA_MIN)) return;
+  if (!(opacity > ALPHA_MIN)) LEAVE;
 #endif
   const float *f = p.f;
   const float sxx = p.sxx, sxy = p.sxy, syy = p.syy, det = p.det;
@@ -106,12 +111,11 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   Box box;
   box_of(f, sqrt(EXTENT(log2o) * largest) / WHITEN * 1.0001f, camera, &box);
   __global float *splat = splats + (size_t)SPLAT_SIZE * i;
-  const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
   store_box(&box, width, height, tiles_x, tiles_y, camera, splat);
   const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
   const uint count = tile_count(&e, tiles_x);
-  if (count == 0) return;
-  tile_counts[i] = count;
+  if (count == 0) LEAVE;
+  SET_TILE_COUNT(i, count);
   for (int k = 0; k < 3; ++k) {
     splat[RAY_FX + k] = f[k];
     splat[RAY_UX + k] = fma1(l11, p.t.e1[k], l12 * p.t.e2[k]);
@@ -131,8 +135,10 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   const float4 colour = sh_colour(basis, 0, SH_OF_GAUSSIAN(i, coefficients), coefficients, sh_dc + 3 * i,
                                   sh_rest + 3 * (coefficients - 1) * i);
   if (!colour_is_drawn(colour)) {
-    tile_counts[i] = 0;
-    return;
+    SET_TILE_COUNT(i, 0);
+    LEAVE;
   }
   store_colour(colour, splat + RAY_RED);
+  KEEP_ELLIPSE(e);
+  COUNT_LISTS
 }

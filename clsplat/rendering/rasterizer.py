@@ -243,7 +243,7 @@ class Rasterizer:
         records = backward and (self._switches.record_cells or tile_items(device) > 1)
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
-            projected = project(device, work, gaussians, camera, camera_array, thinning, chunks)
+            projected = project(device, work, gaussians, camera, camera_array, thinning, chunks, counts_lists=by_append)
             inputs = ImageInputs(projected.splats, colours, camera.width, camera.height, camera_array)
             if by_append:
                 assert room is not None

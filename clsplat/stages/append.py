@@ -36,7 +36,7 @@ device has. Must be a power of two, 16 or more."""
 
 _OFFSET_ITEMS = 1024
 """Number of work-items in each of the two groups of `list_offsets`. The first group handles the lengths of all tiles'
-lists, the second the sums of all groups of `count_tiles`."""
+lists, the second the sums of all groups of the projection."""
 
 
 def appends(device: Device) -> bool:
@@ -57,19 +57,18 @@ def append(
 ) -> tuple[Totals, TileLists]:
     """Make the same tile lists as `duplicate` and `tile_lists`, but without waiting for the device.
 
+    projected: Gaussians that `project` projected with `counts_lists`. Their `list_counts` are overwritten.
     capacity: maximum number of pairs. With more pairs the pass stops (kernels/append.cl).
     tiles: numbers of tiles across and down.
     readback: (READBACK_SIZE,) uint32, filled with the counts of the pass. Pass the same array to `project_step`.
     host: host memory, to which `readback` is copied.
     """
     (n,), number, items = projected.tile_counts.shape, tiles[0] * tiles[1], device.shape.items
-    groups = -(-n // items)
-    counts = work.array("list_counts", (number + 1,), np.uint32)
-    counts.fill(0)
-    slots, sums = work.array("first_slots", (n,), np.uint32), work.array("slot_group_sums", (groups,), np.uint32)
     kernels, splats, tile_counts = device.kernels("append"), projected.splats, projected.tile_counts
-    counted = (projected.shown or tile_counts, tile_counts, splats, counts, slots, sums)
-    launch_groups(device, kernels.count_tiles, groups, items, n, *tiles, *counted)
+    counted = projected.list_counts
+    assert counted is not None, "lists by append need a projection with `counts_lists`"
+    counts, slots, sums = counted.lengths, counted.slots, counted.sums
+    (groups,) = sums.shape
     ranges, order = work.array("ranges", (number, 2), np.uint32), work.array("tile_order", (number,), np.uint32)
     many = max(items, min(_OFFSET_ITEMS, device.max_group))
     offsets, sizes = device.kernels("append", {"ITEMS": many}).list_offsets, (number, groups, capacity)

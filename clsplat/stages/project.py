@@ -34,6 +34,11 @@ STEP_REGISTERS = 80
 """Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
 more items at a time help more than registers. Clang's code for NVIDIA spills nothing with 80, and 64 bytes with 72."""
 
+COUNTING_REGISTERS, COUNTING_REGISTERS_OF_CHUNKS = 64, 72
+"""Maximum registers per item of a projection that counts lists, where the driver accepts a limit: of the whole model,
+and of some of its chunks. With as many, Clang's code for NVIDIA spills nothing; without a limit it has 116, which halve
+the number of items at a time."""
+
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
 
@@ -41,6 +46,20 @@ SCREEN_GRADIENT_BYTES = 8
 def gaussian_bytes(*, keeps_culled: bool) -> int:
     """Return the bytes per Gaussian of `Projected`: splat, tile count and, if `keeps_culled`, an entry of `shown`."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
+
+
+@dataclass(frozen=True, eq=False)
+class ListCounts:
+    """Numbers of pairs of a tile and a Gaussian, which `project` counts for `stages.append.append`.
+
+    lengths: (tiles + 1), the length of each tile's list, then the number of visible Gaussians.
+    slots: (n,), for each Gaussian the number of pairs of earlier Gaussians in the same work-group.
+    sums: (groups,), the number of pairs of each work-group.
+    """
+
+    lengths: DeviceArray
+    slots: DeviceArray
+    sums: DeviceArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +71,14 @@ class Projected:
     shown: (n), 0 for Gaussians without a splat, if frustum culling is switched off. Otherwise None, because Gaussians
     without a splat then have a tile count of 0.
     chunks: the chunks of the model whose Gaussians were projected; None for the whole model.
+    list_counts: the numbers of pairs for lists by append; None if they were not counted.
     """
 
     splats: DeviceArray
     tile_counts: DeviceArray
     shown: DeviceArray | None = None
     chunks: ChunkList | None = None
+    list_counts: ListCounts | None = None
 
     @property
     def chunk_defines(self) -> dict[str, object]:
@@ -110,11 +131,14 @@ def project(
     camera_array: DeviceArray,
     thinning: Thinning | None = None,
     chunks: ChunkList | ChunkNumbers | None = None,
+    *,
+    counts_lists: bool = False,
 ) -> Projected:
     """Project Gaussians to splats, and count the tiles that each splat reaches (Kerbl et al. 2023, section 4).
 
     thinning: random dropout of Gaussians in a step of training; None projects all.
     chunks: the chunks whose Gaussians are projected and have rows in the result. None projects the whole model.
+    counts_lists: True to count the pairs of each tile's list too, for `append`. The model must be on the device.
     """
     n = gaussians.count if chunks is None else chunks.rows
     splats = work.array("splats", (n, len(SPLAT)))
@@ -123,7 +147,8 @@ def project(
     keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL")
     shown = work.array("shown", (n,), np.uint32) if keeps_culled else None
     listed = chunks if isinstance(chunks, ChunkList) else None
-    projected = Projected(splats, tile_counts, shown, listed)
+    list_counts = _list_counts(device, work, n, tiles_of(camera)) if counts_lists else None
+    projected = Projected(splats, tile_counts, shown, listed, list_counts)
     for start, part, out in _projected_parts(work, gaussians, projected, chunks):
         defines = {**out.chunk_defines, **({"SH_DEGREES": True} if "sh_degrees" in part.arrays else {})}
         if part["sh_rest"].dtype == np.float16:
@@ -135,15 +160,14 @@ def project(
             if out.chunks is not None and out.chunks.first_rows is not None:
                 defines["FIRST_ROWS"] = True
                 thinned = (0, *thinning_numbers(thinning), out.chunks.first_rows.buffer)
-        rows = out.tile_counts.shape[0]
-        if rays:
-            kernel, lanes = device.kernels("project_rays", {"LANES": 1, **defines}).project_rays, 1
-        else:
-            kernel, lanes = device.kernels("project", defines).project, device.shape.lanes
-        launch_items(
-            device,
-            kernel,
-            -(-rows // lanes),
+        rows, lanes, counted, registers = out.tile_counts.shape[0], _lanes(device), out.list_counts, 0
+        if counted is not None:
+            assert rows == n, "a streamed model has no passes by capacity"
+            lanes, defines["COUNTS_LISTS"] = 1, True
+            registers = COUNTING_REGISTERS if out.chunks is None else COUNTING_REGISTERS_OF_CHUNKS
+        stem = "project_rays" if rays else "project"
+        kernel = getattr(device.kernels(stem, {**defines, "LANES": lanes}, registers), stem)
+        arguments = (
             rows,
             part.coefficients,
             *((camera.width, camera.height) if rays else tiles_of(camera)),
@@ -155,8 +179,23 @@ def project(
             *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
             *thinned,
             *out.chunk_arguments,
+            *(() if counted is None else (counted.lengths, counted.slots, counted.sums)),
         )
+        if counted is None:
+            launch_items(device, kernel, -(-rows // lanes), *arguments)
+        else:
+            launch_groups(device, kernel, counted.sums.shape[0], device.shape.items, *arguments)
     return projected
+
+
+def _list_counts(device: Device, work: Workspace, n: int, tiles: tuple[int, int]) -> ListCounts:
+    """Arrays for the pairs of `n` Gaussians. tiles: numbers of tiles across and down."""
+    lengths = work.array("list_counts", (tiles[0] * tiles[1] + 1,), np.uint32)
+    lengths.fill(0)
+    groups = -(-n // device.shape.items)
+    return ListCounts(
+        lengths, work.array("first_slots", (n,), np.uint32), work.array("slot_group_sums", (groups,), np.uint32)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -198,10 +198,13 @@ static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
 #define FOR_AXES(k) UNROLL for (int k = 0; k < 3; ++k)
 
 // Defines the rows of a work-item that owns LANES of n rows: first_row, row[LANES] and lanes_used. Past the end, `row`
-// repeats the last row.
+// repeats the last row. An item without rows executes LEAVE (list_counts.h), or else returns.
+#ifndef LEAVE
+#define LEAVE return
+#endif
 #define ROWS_OF_ITEM(n)                                                                                                \
   const uint first_row = get_global_id(0) * LANES;                                                                     \
-  if (first_row >= (n)) return;                                                                                        \
+  if (first_row >= (n)) LEAVE;                                                                                         \
   uint row[LANES];                                                                                                     \
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < (n) ? first_row + lane : (n) - 1;           \
   const uint lanes_used = (n) - first_row < LANES ? (n) - first_row : LANES;

@@ -19,13 +19,12 @@ from clsplat.device.launch import launch_groups
 from clsplat.layouts.columns import READBACK
 from clsplat.reference.append import lists_of
 from clsplat.selftest.case import faults, fresh_readback
-from clsplat.selftest.cases.primitives import APPEND_CASE, boxes_of, depths_of, splats_of_boxes
+from clsplat.selftest.cases.primitives import APPEND_CASE, boxes_of, depths_of, projected_boxes
 from clsplat.stages import append as stages_append
 from clsplat.stages import probe_atomics
 from clsplat.stages.append import append, appends
 from clsplat.stages.duplicate import Band, count, duplicate
 from clsplat.stages.probe_atomics import atomics_fault
-from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists, tile_lists
 
 SCENES = 200
@@ -65,7 +64,8 @@ class Lists:
         self.device, self.tiles, self.work = device, tiles, Workspace(device)
         counts = np.prod(boxes[:, 1::2] - boxes[:, ::2], axis=1).astype(np.uint32)
         self.pairs = int(counts.sum())
-        self.projected = Projected(upload(device, splats_of_boxes(boxes, depths)), upload(device, counts))
+        self.boxes, self.depths, self.counts = boxes, depths, upload(device, counts)
+        self.projected = projected_boxes(device, boxes, depths, tiles, self.counts)
 
     def radix(self) -> list[NDArray[np.uint32]]:
         band, work = Band(0, self.tiles[0] * self.tiles[1]), Workspace(self.device)
@@ -76,7 +76,8 @@ class Lists:
     def appended(self) -> list[NDArray[np.uint32]]:
         host = np.zeros(len(READBACK), np.uint32)
         readback = fresh_readback(self.device)  # must live until the kernels that read it have ended
-        _, lists = append(self.device, self.work, self.projected, self.tiles, readback, self.pairs + 3, host)
+        projected = projected_boxes(self.device, self.boxes, self.depths, self.tiles, self.counts)
+        _, lists = append(self.device, self.work, projected, self.tiles, readback, self.pairs + 3, host)
         return self.read(lists)
 
     def read(self, lists: TileLists) -> list[NDArray[np.uint32]]:

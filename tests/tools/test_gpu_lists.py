@@ -100,17 +100,17 @@ def test_rounds_over_tiles_are_those_of_the_frames_waves() -> None:
     def rounds(kernel: str, text: str, part: bool = False) -> set[float]:
         return {rule.rounds(run) for rule in BY_ITEM[kernel] if rule.part is part and text in rule.text}
 
-    assert rounds("project", "for (int ty") == {1.5}
+    assert rounds("project", "for (int ty") == {1.5, 4}, "the number of tiles, and of each tile's pairs"
     assert rounds("project_step", "addends") == {14}
     assert rounds("duplicate", "for (int ty") == {5}
     assert rounds("duplicate", "tangent", part=True) == {2 / 5}
-    for kernel in ("count_tiles", "append_pairs"):
-        assert rounds(kernel, "for (int ty") == {4}
+    assert rounds("append_pairs", "for (int ty") == {4}
+    for kernel in ("project", "append_pairs"):
         assert rounds(kernel, "tangent", part=True) == {1 / 4}
 
 
 def test_sizes_are_the_kernels() -> None:
-    text = (kernel_root() / "append.cl").read_text()
+    text = (kernel_root() / "shared/list_counts.h").read_text()
     assert re.findall(r"^#define OWN_BOX (\d+)$", text, re.MULTILINE) == [str(OWN_BOX)]
     assert f"#define SMALL_BOX {SMALL_BOX}\n" in (kernel_root() / "shared/tile.h").read_text()
     assert f"#define SIDE (ITEMS < {SIDE} ? ITEMS : {SIDE})\n" in text

@@ -354,8 +354,8 @@ def test_a_limit_of_registers_is_for_ptxas() -> None:
 
 
 def test_a_file_is_compiled_once_for_shapes_that_it_does_not_tell_apart() -> None:
-    """`project` does not name ITEMS, `blend` does, in a file that it includes."""
-    for stem, options, same in (("project", "-DRAYS", True), ("blend", "-DRAYS", False)):
+    """`project_grad` does not name ITEMS, `blend` does, in a file that it includes."""
+    for stem, options, same in (("project_grad", "-DRAYS", True), ("blend", "-DRAYS", False)):
         small, large = (Source(stem, (f"-DITEMS={items}", "-DLANES=1", options, "-cl-std=CL1.2")) for items in (32, 64))
         assert small != large
         assert (small.used == large.used) is same

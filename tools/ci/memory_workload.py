@@ -351,6 +351,7 @@ def lists(device: Device) -> None:
     rng = np.random.default_rng(2)
     check("lists by append", CASES["append"], device, CASES["append"].random(rng, 120))
     stages_append.LOCAL_PAIRS = fits
+    check("list counts", CASES["list_counts"], device, CASES["list_counts"].random(rng, 70))
     if found := atomics_fault(device):
         raise SystemExit(f"the probe of atomics: {found}")
 

@@ -13,11 +13,11 @@ from clsplat.stages.append import LOCAL_PAIRS
 SMALL_BOX = 16
 """Tiles of the largest box that is listed whole, without a test of its rows: SMALL_BOX in tile.h."""
 OWN_BOX = 32
-"""Tiles of the largest box that an item processes alone: OWN_BOX in append.cl."""
+"""Tiles of the largest box that an item processes alone: OWN_BOX in list_counts.h."""
 AHEAD = 4
 """Pairs that an item loads at once: AHEAD in append.cl."""
 SIDE = 8
-"""Items that share a row of tiles of a wide box: SIDE in append.cl."""
+"""Items that share a row of tiles of a wide box: SIDE in list_counts.h."""
 
 
 @dataclass(frozen=True)

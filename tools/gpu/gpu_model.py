@@ -37,7 +37,10 @@ PASSES = 1
 DRIVERS_ITEMS = 256
 """Items per group where the driver chooses."""
 APPENDING, SORTING = ("count_tiles", "append_pairs"), "sort_lists"
-"""Kernels of lists by append with an atomic in global memory for each pair, and the one that sorts the lists."""
+"""Kernels of lists by append with an atomic in global memory for each pair, and the one that sorts the lists.
+count_tiles is in measured code alone."""
+COUNTING = "-DCOUNTS_LISTS"
+"""Beginning of the option of a projection that counts the pairs of lists, with an atomic for each pair."""
 MOVED = {"density_statistics": 0.68}
 """Share of its arrays' bytes that a kernel moves, if it reads only part of their rows. Of a splat's 64 bytes the
 statistics need the first sector of 32; with 36 bytes in other arrays, they move 68 of 100 for each Gaussian."""
@@ -238,8 +241,13 @@ def _work_of(
         cost.first + cost.then.times(pairs),
         longest,
         name,
-        **({"atomics": frame["listed"], "counters": run.lists} if name in APPENDING else {}),
+        **({"atomics": frame["listed"], "counters": run.lists} if _counts_pairs(launch) else {}),
     )
+
+
+def _counts_pairs(launch: Mapping[str, Any]) -> bool:
+    """True if the kernel has an atomic in global memory for each pair."""
+    return launch["kernel"] in APPENDING or any(each.startswith(COUNTING) for each in launch["options"])
 
 
 def _part_of(launch: Mapping[str, Any]) -> float:

@@ -249,7 +249,7 @@ def _sorted_tested(run: Run) -> float:
     return run.boxes.sorted_tested / run.boxes.sorted_rows
 
 
-def _own_active(run: Run) -> float:
+def own_active(run: Run) -> float:
     return run.boxes.own_pairs / run.boxes.wave_tiles
 
 
@@ -267,8 +267,15 @@ ADDENDS = Rule(
 """The sum of a Gaussian's slots in `project_step`."""
 
 
+SHARED_COLUMNS = Rule(
+    "for (int tx = x0 + (int)item % SIDE;",
+    lambda run: run.boxes.shared_rows(run.items) * run.boxes.shared_columns,
+    active=lambda run: run.boxes.rows_at_once(run.items) / run.waves * run.boxes.columns_at_once,
+)
+"""The loop over a row of a wide box, where each wave of a group has rows of its own."""
+_COUNTED_ROWS = "for (int ty = e->tile_y0; ty < e->tile_y1; ++ty) {"
 _ROWS = "for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {"
-_OVER_TILES = (
+OVER_TILES = (
     Rule(_ROWS, lambda run: run.boxes.wave_rows),
     _tested(_ROWS, _own_tested),
     Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide, active=lambda run: 1),  # all read the same
@@ -291,10 +298,22 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule(
             "for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)",
             lambda run: run.boxes.all_tested,
+            function=" tile_count(",
             ends=("count += x1 - x0;",),
             mark=("fp32", 60),
         ),
         Rule("for (int k = 1; k < used; ++k, rest += 3)", bands, mark=("global", 3)),
+        Rule(_COUNTED_ROWS, lambda run: run.boxes.wave_rows),
+        _tested(_COUNTED_ROWS, _own_tested),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx) atomic_inc(",
+            lambda run: run.boxes.wave_tiles,
+            mark=("global", 1),
+            active=own_active,
+        ),
+        Rule("k < group->wides; ++k) {", lambda run: run.boxes.wide, active=lambda run: 1),  # all read the same
+        Rule("for (int row = wide.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
+        SHARED_COLUMNS,
     ),
     "visible_sums": (
         Rule("i < end; i += ITEMS) visible += shown[i] != 0;", _of_item, mark=("global", 1)),
@@ -306,35 +325,20 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("atomic_min(extremes, least)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
     ),
-    "count_tiles": (
-        *_OVER_TILES,
-        Rule(
-            "for (int tx = x0; tx < x1; ++tx) atomic_inc(",
-            lambda run: run.boxes.wave_tiles,
-            mark=("global", 1),
-            active=_own_active,
-        ),
-        Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
-        Rule(
-            "for (int tx = x0 + (int)item % SIDE;",
-            lambda run: run.boxes.shared_rows(run.items) * run.boxes.shared_columns,
-            active=lambda run: run.boxes.rows_at_once(run.items) / run.waves * run.boxes.columns_at_once,
-        ),
-    ),
-    "list_offsets": (  # its elements are the groups of count_tiles
+    "list_offsets": (  # its elements are the groups of project
         Rule("for (uint k = begin; k < end; ++k) {", _of_run, mark=("global", 1)),
         Rule("for (uint tile = begin; tile < end; ++tile) {", _of_run, mark=("shared", 1)),
         Rule("for (uint k = begin; k < end_of_tiles; ++k)", lambda run: run.lists / run.items, mark=("shared", 1)),
         Rule("atomic_max(&longest, most);", lambda run: run.wave),  # AMD's compiler loops over a wave's items
     ),
     "append_pairs": (
-        *_OVER_TILES,
+        *OVER_TILES,
         _unnamed(_ROWS, _own_tested),
         Rule(
             "for (int tx = x0; tx < x1; ++tx, ++slot)",
             lambda run: run.boxes.wave_tiles,
             mark=("global", 3),
-            active=_own_active,
+            active=own_active,
         ),
         Rule("for (int row = e.tile_y0; row < e.tile_y1; ++row)", lambda run: run.boxes.wide * run.boxes.wide_rows),
         Rule(  # a wave has rows of its own

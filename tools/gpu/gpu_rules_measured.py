@@ -6,7 +6,21 @@
 
 from __future__ import annotations
 
-from gpu_rules import ADAM, ADDENDS, BEFORE_PAIRS, REFINED, Rounds, Rule, abreast, bands, group_sum, never
+from gpu_rules import (
+    ADAM,
+    ADDENDS,
+    BEFORE_PAIRS,
+    OVER_TILES,
+    REFINED,
+    SHARED_COLUMNS,
+    Rounds,
+    Rule,
+    abreast,
+    bands,
+    group_sum,
+    never,
+    own_active,
+)
 from gpu_run import BLOCKS, Run
 
 from clsplat.layouts.columns import PLAIN_SLOTS
@@ -98,6 +112,17 @@ MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
         ),
     },
     "37c3be07": {
+        "count_tiles": (
+            *OVER_TILES,
+            Rule(
+                "for (int tx = x0; tx < x1; ++tx) atomic_inc(",
+                lambda run: run.boxes.wave_tiles,
+                mark=("global", 1),
+                active=own_active,
+            ),
+            Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
+            SHARED_COLUMNS,
+        ),
         "project_step": (
             REFINED,
             ADDENDS,

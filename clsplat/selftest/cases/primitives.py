@@ -1,25 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, of prefix sums, and
-of the tile lists that the stage `append` makes."""
+"""Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, of prefix sums, of
+the pairs that the projection counts for lists by append (shared/list_counts.h), and of the lists that the stage
+`append` makes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from clsplat.device.buffers import Workspace, allocate, upload
+from clsplat.camera import Camera
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.layouts.columns import READBACK, SPLAT, TILE
+from clsplat.optimisation.dropout import Thinning
 from clsplat.reference.append import lists_of
-from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
-from clsplat.selftest.harness import Array, CaseBench
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, faults, fresh_readback, read_of
+from clsplat.selftest.cases.steps import random_scene
+from clsplat.selftest.harness import Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import keys
 from clsplat.stages.append import append
-from clsplat.stages.project import Projected
+from clsplat.stages.chunk_lists import ChunkList
+from clsplat.stages.device_camera import pack_camera, tiles_of
+from clsplat.stages.device_gaussians import DeviceGaussians, upload_gaussians
+from clsplat.stages.duplicate import Band, count, duplicate
+from clsplat.stages.project import ListCounts, Projected, project
+from clsplat.stages.ranges import tile_lists
 from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS, scan
 from clsplat.stages.sort import MIN_WIDE_DIGIT_KEYS, bitonic_sort, radix_sort
 
@@ -141,6 +151,104 @@ SCAN_CASE = Case(
 )
 
 
+def group_counts(tile_counts: NDArray[np.integer], items: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    """Return `ListCounts.slots` and `ListCounts.sums` for work-groups of `items` work-items.
+
+    tile_counts: (n,), the number of tiles of each Gaussian.
+    """
+    groups = np.pad(tile_counts.astype(np.int64), (0, -len(tile_counts) % items)).reshape(-1, items)
+    before = (np.cumsum(groups, axis=1) - groups).ravel()[: len(tile_counts)]
+    return before.astype(np.uint32), groups.sum(axis=1).astype(np.uint32)
+
+
+def upload_list_counts(
+    device: Device, tile_counts: NDArray[np.integer], tile_indices: NDArray[np.integer], tiles: int
+) -> ListCounts:
+    """Upload the numbers that the projection would count for Gaussians in these tiles.
+
+    tile_counts: (n,), the number of tiles of each Gaussian.
+    tile_indices: (pairs,), the tile of each pair, in any order.
+    tiles: number of tiles of the image.
+    """
+    lengths = [*np.bincount(tile_indices, minlength=tiles), np.count_nonzero(tile_counts)]
+    arrays = (np.array(lengths, np.uint32), *group_counts(tile_counts, device.shape.items))
+    return ListCounts(*(upload(device, array) for array in arrays))
+
+
+def read_list_counts(
+    device: Device,
+    work: Workspace,
+    model: DeviceGaussians,
+    camera: Camera,
+    camera_array: DeviceArray,
+    thinning: Thinning | None = None,
+    chunks: ChunkList | None = None,
+) -> Read:
+    """Project the model twice: with counts for lists by append, and without. Make the lists of the latter by the radix
+    sorts."""
+    inputs = (model, camera, camera_array, thinning, chunks)
+    counted, plain_work = project(device, work, *inputs, counts_lists=True), Workspace(device)
+    plain, tiles = project(device, plain_work, *inputs), tiles_of(camera)
+    assert counted.list_counts is not None
+    found, band = counted.list_counts, Band(0, tiles[0] * tiles[1])
+    totals = count(device, plain_work, plain)
+    lists = tile_lists(device, plain_work, duplicate(device, plain_work, plain.splats, totals, tiles, band), band)
+    arrays = {
+        "splats": counted.splats,
+        "tile_counts": counted.tile_counts,
+        "lengths": found.lengths,
+        "slots": found.slots,
+        "sums": found.sums,
+        "plain splats": plain.splats,
+        "plain tile_counts": plain.tile_counts,
+        "ranges": lists.ranges,
+    }
+    if counted.shown is not None and plain.shown is not None:
+        arrays |= {"shown": counted.shown, "plain shown": plain.shown}
+
+    def read() -> Arrays:
+        got = read_of(arrays)()
+        for name in ("splats", "plain splats"):  # rows of invisible Gaussians are not written
+            got[name] = np.where((got["plain tile_counts"] > 0)[:, None], got[name], 0)
+            got[name][:, SPLAT.index("UNUSED") :] = 0
+        return {**got, "items": np.array(device.shape.items), "visible": np.array(totals.visible)}
+
+    return read
+
+
+def expected_list_counts(got: Arrays) -> Mapping[str, Expected]:
+    """Expect the splats of the projection that does not count, and the lengths of the lists by the radix sorts.
+
+    got: results of `read_list_counts`, from which those of the second projection are removed.
+    """
+    slots, sums = group_counts(got["plain tile_counts"], int(got.pop("items")))
+    lengths = [*np.diff(got.pop("ranges"), axis=1).ravel(), int(got.pop("visible"))]
+    wanted = {"lengths": np.array(lengths, np.uint32), "slots": slots, "sums": sums}
+    wanted |= {name.removeprefix("plain "): got.pop(name) for name in list(got) if name.startswith("plain ")}
+    return {name: exactly(values) for name, values in wanted.items()}
+
+
+def _random_view(rng: Generator, rows: int) -> Inputs:
+    """A random view of a picture so large that some boxes of tiles are wide."""
+    given = random_scene(rng, rows)
+    given.camera = Camera(210, 150, 180.0, 195.0, 90.0, 81.0, given.camera.rotation, given.camera.translation)
+    return given
+
+
+def _launch_list_counts(device: Device, work: Workspace, given: Inputs) -> Read:
+    camera_array = upload(device, pack_camera(given.camera))
+    return read_list_counts(device, work, upload_gaussians(device, given.gaussians), given.camera, camera_array)
+
+
+LIST_COUNTS_CASE = Case(
+    sizes=(1, 63, 65, 700, 2, 64, 255, 256, 257, 1025),
+    random=_random_view,
+    launch=_launch_list_counts,
+    twin=lambda _, got: expected_list_counts(got),
+    digested=("splats", "tile_counts", "lengths"),
+)
+
+
 _WHOLE_BOX = 16
 """Largest number of tiles in a box of which all tiles are listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
 _EVERYWHERE = 1e6
@@ -176,6 +284,23 @@ def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.in
     return [
         (np.arange(y0, y1)[:, None] * tiles_x + np.arange(x0, x1)).ravel() for x0, x1, y0, y1 in boxes.astype(np.int64)
     ]
+
+
+def projected_boxes(
+    device: Device,
+    boxes: NDArray[np.int64],
+    depths: NDArray[np.float32],
+    tiles: tuple[int, int],
+    tile_counts: DeviceArray,
+) -> Projected:
+    """Upload what the projection would make of the Gaussians with these boxes of tiles: splats and list counts.
+
+    tiles: numbers of tiles across and down.
+    tile_counts: (n,), the number of tiles of each box.
+    """
+    pairs = np.concatenate([np.zeros(0, np.int64), *tiles_of_boxes(boxes, tiles[0])])
+    list_counts = upload_list_counts(device, tile_counts.get(), pairs, tiles[0] * tiles[1])
+    return Projected(upload(device, splats_of_boxes(boxes, depths)), tile_counts, list_counts=list_counts)
 
 
 def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.int64]:
@@ -225,10 +350,9 @@ def _frozen_boxes(bench: CaseBench) -> list[Inputs]:
 
 
 def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
-    splats, counts = splats_of_boxes(given.boxes, given.depths), upload(device, given.counts)
-    readback, host = fresh_readback(device), np.zeros(len(READBACK), np.uint32)
-    numbers = (given.tiles, readback, given.capacity, host)
-    totals, lists = append(device, work, Projected(upload(device, splats), counts), *numbers)
+    counts, readback, host = upload(device, given.counts), fresh_readback(device), np.zeros(len(READBACK), np.uint32)
+    projected = projected_boxes(device, given.boxes, given.depths, given.tiles, counts)
+    totals, lists = append(device, work, projected, given.tiles, readback, given.capacity, host)
 
     def read() -> Arrays:
         assert totals.arriving is not None
@@ -281,3 +405,11 @@ APPEND_CASE = Case(
     frozen=_frozen_boxes,
     digested=("counts", "ranges", "gaussians", "slots"),
 )
+
+
+def of_append(bench: CaseBench) -> StageOutcome:
+    """Test the lists by append, and the pairs that the projection of the frozen scene counts for such lists."""
+    outcome = APPEND_CASE.outcome(bench)
+    given = Inputs(gaussians=bench.frozen.gaussians, camera=bench.camera)
+    wrong = faults(LIST_COUNTS_CASE.errors(bench.device, given))
+    return replace(outcome, trouble=outcome.trouble or ", ".join(wrong))

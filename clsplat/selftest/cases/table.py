@@ -15,7 +15,15 @@ from clsplat.selftest.cases.library import HARMONICS_CASE, SPLATS_CASE, of_ewa, 
 from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE, of_depth
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
-from clsplat.selftest.cases.primitives import APPEND_CASE, BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
+from clsplat.selftest.cases.primitives import (
+    APPEND_CASE,
+    BITONIC_CASE,
+    ELEMENTARY_CASE,
+    LIST_COUNTS_CASE,
+    SCAN_CASE,
+    SORT_CASE,
+    of_append,
+)
 from clsplat.selftest.cases.region import REGION_CASE
 from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE, SETTLE_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
@@ -25,6 +33,7 @@ CASES: dict[str, Case] = {
     "sort": SORT_CASE,
     "bitonic sort": BITONIC_CASE,
     "scan": SCAN_CASE,
+    "list_counts": LIST_COUNTS_CASE,
     "append": APPEND_CASE,
     "loss": LOSS_CASE,
     "masks": MASKS_CASE,
@@ -52,6 +61,7 @@ CASES: dict[str, Case] = {
 OUTCOMES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
     **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},
     **CORE_STAGES,
+    "append": of_append,
     "statistics": of_statistics,
     **PICTURE_CASES,
     "depth": of_depth,
