@@ -74,7 +74,7 @@ class ChunkBounds:
 
     def __len__(self) -> int:
         """Number of chunks."""
-        return self.terms.shape[1]
+        return len(self.terms[0])
 
     @property
     def lowest(self) -> Float64:
@@ -103,12 +103,15 @@ class ChunkBounds:
         mean_step, log_scale_step: the most by which a coordinate of a mean, and a log scale, have changed: a number for
             all chunks, or an array (B,). `with_rounding` adds the rounding of updates.
         """
-        terms = self.terms.copy()
         with np.errstate(invalid="ignore", over="ignore"):
-            terms[3:6] += mean_step
-            terms[7] += 3 * self.factor * mean_step
-            terms[6] *= np.exp(log_scale_step)
-        return ChunkBounds(terms, self.factor)
+            return ChunkBounds(self.terms.copy(), self.factor).widen(mean_step, log_scale_step)
+
+    def widen(self, mean_step: float | Float64, log_scale_step: float | Float64) -> ChunkBounds:
+        """Change the bounds to those that `widened` returns, and return this object. NumPy may warn of infinities."""
+        self.terms[3:6] += mean_step
+        self.terms[7] += 3 * self.factor * mean_step
+        self.terms[6] *= np.exp(log_scale_step)
+        return self
 
     def with_rounding(self, updates: int) -> ChunkBounds:
         """Return the bounds after `updates` updates of each parameter by 0, each of which rounds it to float32. For
@@ -128,8 +131,8 @@ class ChunkBounds:
 
 
 def measured_sides(means: Float32, log_scales: Float32, rows: int = CHUNK_ROWS) -> Float32:
-    """Return an array (B, 7) for the chunks of a model: the smallest and largest coordinates (3 each) of their means, and
-    their largest log scales. The kernel `bounds` (`stages/bounds.py`) measures the same on a device.
+    """Return an array (B, 7) for a model's chunks: the smallest coordinates (3) of their means, the largest coordinates
+    (3), and the largest log scales. The kernel `bounds` (`stages/bounds.py`) measures the same on a device.
 
     means, log_scales: (n, 3). rows: number of Gaussians in a chunk.
     """

@@ -75,7 +75,9 @@ class BoundsTable:
         moved[:, numbers] = after
         self._most_moved = np.maximum(self._most_moved, after.max(axis=1, initial=0.0, keepdims=True))
 
-    def seen(self, sees: Sees, hidden: Movement | None = None, most_hidden: Float64 | float = 0.0) -> NDArray[np.uint32]:
+    def seen(
+        self, sees: Sees, hidden: Movement | None = None, most_hidden: Float64 | float = 0.0
+    ) -> NDArray[np.uint32]:
         """Return the numbers of the chunks for which `sees` is True, rising. Only chunks of groups in view are tested.
 
         sees: function that tells which bounds are in view.
@@ -84,16 +86,17 @@ class BoundsTable:
         most_hidden: (2, 1), the largest of these changes in any chunk; 0 if no chunk has missed a step.
         """
         most = self._most_moved + self._rounded_share * most_hidden
-        groups: NDArray[np.int64] | None = None
+        near: NDArray[np.int64] | None = None
         """Groups in view whose members are tested next; None for all."""
-        for level, count in zip(reversed(self._levels[1:]), reversed(self._counts[1:]), strict=True):
-            bounds = ChunkBounds(_columns(level, groups, count), GROUP_FACTOR).widened(*most)
-            groups = _numbers(sees(bounds), groups)
-        near, moved = (_columns(each, groups, self._counts[0]) for each in (self._levels[0], self._moved))
-        if hidden is not None:
-            chunks = _numbers(np.ones(near.shape[1], np.bool_), groups)
-            moved = moved + self._rounded_share * hidden(chunks)
-        return _numbers(sees(ChunkBounds(near).widened(*moved)), groups).astype(np.uint32)
+        with np.errstate(invalid="ignore", over="ignore"):
+            for level, count in zip(reversed(self._levels[1:]), reversed(self._counts[1:]), strict=True):
+                numbers = _numbers(near, count)
+                near = numbers[sees(ChunkBounds(_columns(level, near, numbers), GROUP_FACTOR).widen(*most))]
+            numbers = _numbers(near, self._counts[0])
+            terms, moved = (_columns(each, near, numbers) for each in (self._levels[0], self._moved))
+            if hidden is not None:
+                moved += self._rounded_share * hidden(numbers)
+            return numbers[sees(ChunkBounds(terms).widen(*moved))].astype(np.uint32)
 
 
 def _members(groups: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -101,20 +104,21 @@ def _members(groups: NDArray[np.int64]) -> NDArray[np.int64]:
     return GROUP * groups[:, None] + np.arange(GROUP)
 
 
-def _columns(level: Float64, groups: NDArray[np.int64] | None, count: int) -> Float64:
-    """Return the columns (k, n) of some groups of a level (k, groups, GROUP), without the level's padding.
+def _numbers(groups: NDArray[np.int64] | None, count: int) -> NDArray[np.int64]:
+    """Return the numbers (n,) of the members of groups, rising. groups: numbers of the groups, rising; None for all.
 
-    groups: numbers of the groups, rising; None for all.
-    count: number of columns of the level without padding.
+    count: number of members of all groups.
     """
     if groups is None:
-        return level.reshape(len(level), -1)[:, :count]
-    columns = level.take(groups, axis=1).reshape(len(level), -1)
-    padding = level.shape[1] * GROUP - count
-    return columns[:, :-padding] if padding and len(groups) and groups[-1] == level.shape[1] - 1 else columns
+        return np.arange(count)
+    numbers = _members(groups).ravel()
+    return numbers if len(numbers) == 0 or numbers[-1] < count else numbers[numbers < count]
 
 
-def _numbers(chosen: Bool, groups: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    """Return the numbers of the columns that are chosen. chosen: (n,), for the columns that `_columns` returns."""
-    places = np.flatnonzero(chosen)
-    return places if groups is None else GROUP * groups[places // GROUP] + places % GROUP
+def _columns(level: Float64, groups: NDArray[np.int64] | None, numbers: NDArray[np.int64]) -> Float64:
+    """Return a copy (k, n) of some columns of a level (k, groups, GROUP), which is padded behind its last column.
+
+    groups: numbers of the groups, rising; None for all. numbers: (n,), numbers of their columns.
+    """
+    columns = level.copy() if groups is None else level.take(groups, axis=1)
+    return columns.reshape(len(level), -1)[:, : len(numbers)]

@@ -146,7 +146,8 @@ class PictureBorders:
         constant += pixels if parallel else 0.0
         by_distance = _ROUNDING * np.sqrt((normals * normals).sum(axis=1)) + (0.0 if parallel else pixels)
         by_distance = self.stretch * by_distance[:, None]
-        by_half = np.abs(in_world) + GROUP_FACTOR * by_distance  # the sum of the half sides is more than half a diagonal
+        # the corner is farther away than the middle by at most the sum of the half sides
+        by_half = np.abs(in_world) + GROUP_FACTOR * by_distance
         centre = np.asarray(np.linalg.solve(camera.rotation, -camera.translation)[:, None], np.float64)
         return _Planes(np.hstack([in_world, by_half, along]), by_distance, -constant[:, None], centre)
 
@@ -171,10 +172,10 @@ def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
 
 
 def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
-    """Return True (B,) for chunks beyond a side of a picture with an image plane, or beyond the near or far plane. Bounds
-    that are not finite give NaN or infinity here, so False.
+    """Return True (B,) for chunks beyond a side of a picture with an image plane, or beyond the near or far plane.
 
-    Every step calls it for its view, so it makes few calls of NumPy: each takes longer than a hundred chunks.
+    Bounds that are not finite give NaN or infinity here, and so False. Each step calls this function, whose time for a
+    few hundred chunks is that of its calls of NumPy, so these are few.
     """
     planes = picture.planes
     # einsum instead of @, because BLAS would start threads even for this small product, and they spin while they wait

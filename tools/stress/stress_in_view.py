@@ -5,10 +5,10 @@
         [--dense] [--device DEVICE] [--json]
 
 The large model is the plain of `run large`, all in memory. For each of its views there is a small model of the chunks
-that the view shows. A step of the large model and a step of the small model of the same view take turns in this process,
-each of them first in half of the pairs. A block is as many pairs as there are steps between two measurements of bounds.
-Prints the medians over the blocks: a step's wall time and processor time of all threads, and the ratios of these. What
-a ratio exceeds 1 by is the cost of the chunks out of view.
+that the view shows. Both models take a step of the same view, one after the other in this process, and each of them is
+first in half of the pairs. A block is as many pairs as there are steps between two measurements of bounds. Prints
+medians over the blocks: a step's wall time, its processor time of all threads, and the ratios of both. What a ratio
+exceeds 1 by is the cost of the chunks out of view.
 
 --width: widths of the photographs in pixels. --height: heights of the cameras above the plain, which decide how many
 chunks a view shows.
@@ -81,11 +81,11 @@ def timed_step(trainer: Trainer) -> Float64:
 
 
 def paired_steps(large: Trainer, small: Sequence[Trainer], blocks: int) -> Float64:
-    """Mean times (blocks, 2, 2) of steps: of the large model, then of the small; in each wall time, then processor time.
+    """Mean times (blocks, 2, 2) of steps: of the large model, then of the small ones; wall time, then processor time.
 
     small: the trainer of each view's chunks.
     """
-    found = []
+    found: list[list[Float64]] = []
     while len(found) < blocks * STEPS_PER_MEASUREMENT:
         queue = large.position.queue
         if not queue:  # the next view is unknown: the first step of a pass is not timed
@@ -142,7 +142,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--device")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    require(options.views > 1, f"--views {options.views}: expected at least 2, as the first step of a pass is not timed")
+    require(options.views > 1, f"--views {options.views}: expected at least 2, as a pass's first step is not timed")
     require(options.blocks > 0, f"--blocks {options.blocks}: expected at least 1")
     device = open_device(options.device)
     config = replace(settings(1000, options.degree, dense=options.dense), iterations=1_000_000)

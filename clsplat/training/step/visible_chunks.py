@@ -7,14 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.chunks.bounds import hidden_path, largest_resumed_step, largest_step, measured_sides
+from clsplat.chunks.bounds import largest_resumed_step, measured_sides
 from clsplat.chunks.bounds_table import BoundsTable, Movement
 from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.chunks.division import chunks_of
@@ -32,9 +31,9 @@ from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
-from clsplat.training.learning_rates import largest_rates, scaled, scaled_rates
 from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import PlacedChunks, ViewInputs
+from clsplat.training.step.movement import MovementLimits
 
 STEPS_PER_MEASUREMENT = 16
 """Number of steps after which the bounds of the chunks that took part in them are measured again. With more steps,
@@ -116,18 +115,12 @@ class VisibleChunks(Component):
         count: int,
         next_cameras: Callable[[], Sequence[Camera]],
     ) -> None:
-        self._config, self._rasterizer, self._unit, self._next_cameras = config, rasterizer, unit, next_cameras
-        self._optimiser = scaled(config.optimiser, config.batch)
+        self._config, self._rasterizer, self._next_cameras = config, rasterizer, next_cameras
+        self._limits = MovementLimits(config, unit)
         self._borders = lru_cache(_KEPT_BORDERS)(PictureBorders.of)
         self._ahead: dict[tuple[Camera, int, BoundsTable], NDArray[np.uint32]] = {}
         """Chunks that a view of the next step may show, by its camera, the step's number and the bounds."""
-        self._limit_movement(largest_step(self._optimiser))
         self._begin(count, 0)
-
-    def _limit_movement(self, limit: float) -> None:
-        """Set the limit of a parameter's movement in one step of Adam, as a multiple of the learning rate."""
-        self._step_limit = limit
-        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._optimiser, limit)
 
     def _begin(self, count: int, step: int, chunks: int = 0) -> None:
         """Forget all bounds. The model has `count` Gaussians, and all have taken step number `step`.
@@ -172,7 +165,7 @@ class VisibleChunks(Component):
     def on(self) -> bool:
         """True if steps may leave out chunks that the view does not show. Steps with the present settings then change
         the Gaussians of such chunks only by Adam, and do not read their gradients."""
-        return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
+        return runs_by_chunk(self._config, self._rasterizer.device) and self._limits.finite
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
         """True if bounds must be measured before the next step."""
@@ -181,8 +174,8 @@ class VisibleChunks(Component):
     @property
     def reads_all_rows(self) -> bool:
         """True if some chunk has missed so many steps that all chunks are caught up before bounds are next measured."""
-        sparse = self._config.optimiser.sparse
-        return not sparse and self.step - int(self._last.min(initial=self.step)) >= MOST_MISSED_STEPS
+        oldest = self.step if self._config.optimiser.sparse else int(self._last.min(initial=self.step))
+        return self.step - oldest >= MOST_MISSED_STEPS
 
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Measure the bounds of chunks whose Gaussians may have moved."""
@@ -244,14 +237,13 @@ class VisibleChunks(Component):
         self._since += 1
         if whole:
             numbers = np.arange(len(self._last), dtype=np.uint32)
-        moved = self._step_limit * self._mean_and_scale_rates(range(step, step + 1))
+        moved = self._limits.in_step(step)
         self._note_movement(numbers, moved if hidden is None else moved + hidden(numbers))
         missed = self._missed(numbers, step - 1)
         of_step = _ChunksInView(self, numbers, numbers, missed, self._found, whole=whole)
-        return [
-            replace(each, chunks=of_step if len(inputs) == 1 else replace(of_step, in_view=found))
-            for each, found in zip(inputs, by_view, strict=True)
-        ]
+        for each, found in zip(inputs, by_view, strict=True):
+            each.chunks = of_step if len(inputs) == 1 else replace(of_step, in_view=found)
+        return inputs
 
     def after_adam(self, gaussians: AnyGaussians) -> None:  # noqa: ARG002
         """Find the chunks that the next step's views may show, while the device still computes the step just launched.
@@ -294,19 +286,8 @@ class VisibleChunks(Component):
         if self._config.optimiser.sparse:
             return None, 0.0
         oldest = min(self._oldest, step - 1)
-        rates = self._mean_and_scale_rates(range(oldest + 1, step + 1))
-
-        def path(last: NDArray[np.uint32] | int) -> Float64:
-            return rates * np.minimum(self._step_limit * (step - 1 - last), self._hidden_limit)
-
+        path = partial(self._limits.in_missed_steps, oldest, step)
         return lambda chunks: path(self._last[chunks]), path(oldest)
-
-    def _mean_and_scale_rates(self, steps: range) -> Float64:
-        """Upper limits (2, 1) of the learning rates of means and log scales in the steps with the numbers `steps`."""
-        batch = self._config.batch
-        views = range((steps[0] - 1) * batch + 1, steps[-1] * batch + 1)
-        rates = scaled_rates(largest_rates(self._config, views, self._unit), batch)
-        return np.array([[rates["means"]], [rates["log_scales"]]])
 
     def _number(self, views: int) -> int:
         """Return Adam's number of the step that the training's view number `views` is in."""
@@ -407,7 +388,7 @@ class VisibleChunks(Component):
         padded = np.full(on_device.shape, step, np.uint32)
         padded[: len(last)] = last
         on_device.send(padded)
-        catch_up(device, self._optimiser, model, chunks, on_device, caught, step, table, readback)
+        catch_up(device, self._limits.optimiser, model, chunks, on_device, caught, step, table, readback)
 
     def step_back(self, step: int) -> None:
         """Return to the state after the step that ended with view number `step`. Chunks that have been caught up since
@@ -425,8 +406,8 @@ class VisibleChunks(Component):
         if missed is None:
             return
         self._catch_up((parameters, first, second), missed)
-        hidden, _ = self._hidden_movement(missed.step + 1)
-        self._note_movement(missed.numbers, hidden(missed.numbers))
+        limit = self._limits.in_missed_steps(self._oldest, missed.step + 1, self._last[missed.numbers])
+        self._note_movement(missed.numbers, limit)
         self._last[missed.numbers] = missed.step
 
     def rows_changed(self, groups: set[str]) -> None:
@@ -452,7 +433,7 @@ class VisibleChunks(Component):
                 with np.errstate(divide="ignore", invalid="ignore"):
                     each = np.abs(first[group][rows]) / np.sqrt(second[group][rows])
                 ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN is 0 / 0: no gradient yet
-        self._limit_movement(largest_resumed_step(self._optimiser, ratio, self._number(step)))
+        self._limits.set(largest_resumed_step(self._limits.optimiser, ratio, self._number(step)))
         self._begin(count, self._number(step))
 
     @property
