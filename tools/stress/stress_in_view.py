@@ -47,7 +47,7 @@ EPOCHS_BEFORE = 4
 
 @dataclass(frozen=True)
 class Case:
-    """What is measured: number of Gaussians, width of the photographs, height of the cameras, number of views."""
+    """Number of Gaussians, width of the photographs in pixels, height of the cameras in world units, views."""
 
     count: int
     width: int
