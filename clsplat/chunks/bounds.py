@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -32,18 +31,37 @@ _LEAST_EPSILON = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class ChunkBounds:
-    """Bounds of B chunks, in float64.
+    """Bounds of B chunks.
 
-    lowest, highest: (B, 3), the smallest and largest coordinates of the means, in world units.
-    largest: (B,), the largest log scale.
-    factor: factor on the radii of spheres around the boxes, and on the magnitudes in `terms`. It is GROUP_FACTOR for
-        bounds of groups, so that a group is visible wherever one of its chunks is.
+    terms: (8, B), float64. The rows are the middles (3) and half sides (3) of boxes around the means, in world units,
+        the largest standard deviations, and magnitudes. A magnitude, which rounding errors are relative to, is `factor`
+        times the sum of the absolute coordinates of the box's farthest corner. NaN in all rows of a chunk whose bounds
+        are not finite.
+    factor: factor on the radii of spheres around the boxes, and on the magnitudes. It is GROUP_FACTOR for bounds of
+        groups, so that a group is visible wherever one of its chunks is.
     """
 
-    lowest: Float64
-    highest: Float64
-    largest: Float64
+    terms: Float64
     factor: float = 1.0
+
+    @classmethod
+    def of_sides(cls, lowest: Float64, highest: Float64, largest: Float64) -> ChunkBounds:
+        """Return the bounds of chunks, given the smallest and largest coordinates (B, 3) of their means, and their
+        largest log scales (B,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            bounds = cls.around(lowest.T, highest.T, np.exp(largest))
+            finite = np.isfinite(lowest.sum(axis=1) + highest.sum(axis=1) + largest)
+        bounds.terms[:, ~finite] = np.nan
+        return bounds
+
+    @classmethod
+    def around(cls, lowest: Float64, highest: Float64, deviation: Float64, factor: float = 1.0) -> ChunkBounds:
+        """Return the bounds of boxes, given their smallest and largest coordinates (3, B), and their largest standard
+        deviations (B,). factor: as in the class."""
+        terms = np.empty((8, len(deviation)))
+        terms[:3], terms[3:6], terms[6] = 0.5 * (lowest + highest), 0.5 * (highest - lowest), deviation
+        terms[7] = factor * (np.abs(terms[:3]) + terms[3:6]).sum(axis=0)
+        return cls(terms, factor)
 
     @classmethod
     def measured(cls, means: Float32, log_scales: Float32, rows: int = CHUNK_ROWS) -> ChunkBounds:
@@ -51,69 +69,85 @@ class ChunkBounds:
 
         rows: number of Gaussians in a chunk.
         """
-        starts = np.arange(0, len(means), rows)
-        if len(starts) == 0:
-            return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-        lowest, highest = np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts)
-        largest = np.maximum.reduceat(log_scales.max(axis=1), starts)
-        return cls(lowest.astype(np.float64), highest.astype(np.float64), largest.astype(np.float64))
+        lowest, highest, largest = np.hsplit(measured_sides(means, log_scales, rows).astype(np.float64), (3, 6))
+        return cls.of_sides(lowest, highest, largest[:, 0])
 
     def __len__(self) -> int:
         """Number of chunks."""
-        return len(self.largest)
+        return len(self.terms[0])
 
-    @cached_property
+    @property
+    def lowest(self) -> Float64:
+        """The smallest coordinates (B, 3) of the means."""
+        return np.asarray((self.terms[:3] - self.terms[3:6]).T)
+
+    @property
+    def highest(self) -> Float64:
+        """The largest coordinates (B, 3) of the means."""
+        return np.asarray((self.terms[:3] + self.terms[3:6]).T)
+
+    @property
     def finite(self) -> Bool:
         """Array (B,): True for chunks with finite bounds."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(np.isfinite(self.lowest.sum(axis=1) + self.highest.sum(axis=1) + self.largest))
+        return np.asarray(np.isfinite(self.terms.sum(axis=0)))
 
-    @cached_property
-    def terms(self) -> Float64:
-        """Array (8, B) whose rows are the boxes' middles (3), half sides (3), largest standard deviations, magnitudes.
-
-        A magnitude, which rounding errors are relative to, is `factor` times the sum of the absolute coordinates of the
-        box's farthest corner.
-        """
-        with np.errstate(over="ignore", invalid="ignore"):
-            middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
-            farthest = self.factor * (np.abs(middle) + half).sum(axis=0)
-            return np.vstack([middle, half, np.exp(self.largest), farthest])
-
-    @cached_property
+    @property
     def radius(self) -> Float64:
         """Radii (B,) of spheres around the boxes: half the diagonal, times `factor`."""
         half = self.terms[3:6]
         return np.asarray(self.factor * np.sqrt(np.einsum("ij,ij->j", half, half)))
 
-    def widened(self, mean_step: float | Float64, log_scale_step: float | Float64, updates: int = 0) -> ChunkBounds:
+    def widened(self, mean_step: float | Float64, log_scale_step: float | Float64) -> ChunkBounds:
         """Return the bounds after training steps that may have moved the Gaussians.
 
         mean_step, log_scale_step: the most by which a coordinate of a mean, and a log scale, have changed: a number for
-            all chunks, or an array (B,).
-        updates: number of updates of a parameter in these steps, each of which rounds it to float32.
+            all chunks, or an array (B,). `with_rounding` adds the rounding of updates.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            x, y, z = np.maximum(np.abs(self.lowest), np.abs(self.highest)).T
-            size = np.maximum(np.maximum(x, y), z)
-            by = _with_rounding(mean_step, size, updates)[:, None]
-            larger = _with_rounding(log_scale_step, np.abs(self.largest), updates)
-            return ChunkBounds(self.lowest - by, self.highest + by, self.largest + larger, self.factor)
+            return ChunkBounds(self.terms.copy(), self.factor).widen(mean_step, log_scale_step)
+
+    def widen(self, mean_step: float | Float64, log_scale_step: float | Float64) -> ChunkBounds:
+        """Change the bounds to those that `widened` returns, and return this object. NumPy may warn of infinities."""
+        self.terms[3:6] += mean_step
+        self.terms[7] += 3 * self.factor * mean_step
+        self.terms[6] *= np.exp(log_scale_step)
+        return self
+
+    def with_rounding(self, updates: int) -> ChunkBounds:
+        """Return the bounds after `updates` updates of each parameter by 0, each of which rounds it to float32. For
+        other updates, widen the result by their sum times `rounded_share(updates)`.
+
+        After a change by d a value is at most size + d, if its absolute value before is at most `size`. So each
+        rounding is at most (size + d) 2^-24, and the change with n roundings is at most
+
+            d = (step + n 2^-24 size) / (1 - n 2^-24),
+
+        where `step` is the largest sum of all updates without rounding.
+        """
+        terms, share = self.terms, updates * _HALF_ULP * rounded_share(updates)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            size = (np.abs(terms[:3]) + terms[3:6]).max(axis=0, initial=0.0)
+            return self.widened(share * size, share * np.abs(np.log(terms[6])))
 
 
-def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:
-    """Return the largest change (B,) of values by `updates` updates, each rounded to float32.
+def measured_sides(means: Float32, log_scales: Float32, rows: int = CHUNK_ROWS) -> Float32:
+    """Return an array (B, 7) for a model's chunks: the smallest coordinates (3) of their means, the largest coordinates
+    (3), and the largest log scales. The kernel `bounds` (`stages/bounds.py`) measures the same on a device.
 
-    After a change by d the values are at most size + d, so that each rounding is at most (size + d) 2^-24.
-
-    step: the largest sum of all updates, without rounding.
-    size: (B,), the largest absolute values before the updates.
+    means, log_scales: (n, 3). rows: number of Gaussians in a chunk.
     """
+    starts = np.arange(0, len(means), rows)
+    if len(starts) == 0:
+        return np.zeros((0, 7), np.float32)
+    lowest, highest = np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts)
+    largest = np.maximum.reduceat(log_scales.max(axis=1), starts)
+    return np.column_stack([lowest, highest, largest])
+
+
+def rounded_share(updates: int) -> float:
+    """Return the factor on the sum of all updates in `ChunkBounds.with_rounding`; infinite for too many updates."""
     share = updates * _HALF_ULP
-    if share >= 1:
-        return np.full(len(size), np.inf)
-    moved: Float64 = (step + share * size) / (1 - share)
-    return moved
+    return 1 / (1 - share) if share < 1 else math.inf
 
 
 def largest_step(config: OptimiserConfig) -> float:

@@ -20,7 +20,7 @@ from clsplat.cameras.equirectangular import Equirectangular
 from clsplat.cameras.fisheye import MIN_FISHEYE_SLOPE, Fisheye
 from clsplat.cameras.model import CameraModel
 from clsplat.cameras.perspective import PerspectiveByRays
-from clsplat.chunks.bounds import ChunkBounds
+from clsplat.chunks.bounds import GROUP_FACTOR, ChunkBounds
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.layouts.columns import TILE
 
@@ -52,14 +52,14 @@ class _Planes:
     A function is the sum of three parts. It is negative if the whole chunk is beyond the plane.
 
     terms: (6, 8), factors of `ChunkBounds.terms`.
-    by_distance: (6,), factors of the distance of a box's farthest corner from the camera.
-    constant: (6,), constant parts.
+    by_distance: (6, 1), factors of the distance of a box's middle from the camera.
+    limit: (6, 1), the constant parts, negated: the function is negative if the other two parts are below it.
     centre: (3, 1), the camera's centre in the world.
     """
 
     terms: Float64
     by_distance: Float64
-    constant: Float64
+    limit: Float64
     centre: Float64
 
 
@@ -145,8 +145,11 @@ class PictureBorders:
         constant += _ROUNDING * np.abs(offsets) + _CANCELLED * sums * np.abs(camera.translation).sum()
         constant += pixels if parallel else 0.0
         by_distance = _ROUNDING * np.sqrt((normals * normals).sum(axis=1)) + (0.0 if parallel else pixels)
+        by_distance = self.stretch * by_distance[:, None]
+        # the corner is farther away than the middle by at most the sum of the half sides
+        by_half = np.abs(in_world) + GROUP_FACTOR * by_distance
         centre = np.asarray(np.linalg.solve(camera.rotation, -camera.translation)[:, None], np.float64)
-        return _Planes(np.hstack([in_world, np.abs(in_world), along]), by_distance, constant, centre)
+        return _Planes(np.hstack([in_world, by_half, along]), by_distance, -constant[:, None], centre)
 
 
 def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
@@ -154,31 +157,32 @@ def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
 
     Chunks whose bounds are not finite are visible. The bounds must also hold for Gaussians that were added to a chunk.
     """
-    if not picture.culls or len(bounds) == 0:
-        return np.ones(len(bounds), np.bool_)
     model = picture.camera.model
-    hidden = np.zeros(len(bounds), np.bool_)
+    if not picture.culls or len(bounds) == 0 or not (model.along_rays or model.is_pinhole or model.parallel):
+        return np.ones(len(bounds), np.bool_)
     with np.errstate(all="ignore"):  # NaN compares as visible
-        if model.along_rays:
-            cones = _cones(bounds, picture)
-            hidden |= _out_of_depth(cones, picture)
-            for kind, beyond in _ALONG_RAYS.items():
-                if isinstance(model, kind):
-                    hidden |= beyond(cones, picture)
-        elif model.is_pinhole or model.parallel:
-            hidden |= _beyond_planes(bounds, picture)
+        if not model.along_rays:
+            return ~_beyond_planes(bounds, picture)
+        cones = _cones(bounds, picture)
+        hidden = _out_of_depth(cones, picture)
+        for kind, beyond in _ALONG_RAYS.items():
+            if isinstance(model, kind):
+                hidden |= beyond(cones, picture)
         return ~hidden | ~bounds.finite
 
 
 def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
-    """Return True (B,) for chunks beyond a side of a picture with an image plane, or beyond the near or far plane."""
+    """Return True (B,) for chunks beyond a side of a picture with an image plane, or beyond the near or far plane.
+
+    Bounds that are not finite give NaN or infinity here, and so False. Each step calls this function, whose time for a
+    few hundred chunks is that of its calls of NumPy, so these are few.
+    """
     planes = picture.planes
     # einsum instead of @, because BLAS would start threads even for this small product, and they spin while they wait
     farthest_corner = np.einsum("pk,kb->pb", planes.terms, bounds.terms)
     away = bounds.terms[:3] - planes.centre
-    distance = picture.stretch * (np.sqrt(np.einsum("ij,ij->j", away, away)) + bounds.radius)
-    farthest_corner += planes.by_distance[:, None] * distance
-    return np.asarray((farthest_corner + planes.constant[:, None]).min(axis=0) < 0)
+    farthest_corner += planes.by_distance * np.sqrt(np.einsum("ij,ij->j", away, away))
+    return np.asarray((farthest_corner < planes.limit).any(axis=0))
 
 
 @dataclass(frozen=True, eq=False)

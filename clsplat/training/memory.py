@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.chunks.bounds import ChunkBounds
+from clsplat.chunks.bounds import measured_sides
 from clsplat.chunks.bounds_table import BoundsTable
 from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.chunks.division import chunks_of, listed_chunks
@@ -224,12 +224,11 @@ def _least_pool(record: int) -> int:
 
 def most_in_view(gaussians: Gaussians, cameras: Iterable[Camera], config: TrainConfig) -> int:
     """Return the largest number of chunks that one camera may show. gaussians: a model in the order of its chunks."""
-    bounds, still = ChunkBounds.measured(gaussians.means, gaussians.log_scales), np.zeros((2, 1))
-    table, updates = BoundsTable(len(bounds)), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT
-    measured = np.hstack([bounds.lowest, bounds.highest, bounds.largest[:, None]])
-    table.measure(np.arange(len(bounds), dtype=np.uint32), measured.astype(np.float32))
+    measured = measured_sides(gaussians.means, gaussians.log_scales)
+    table = BoundsTable(len(measured), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
+    table.measure(np.arange(len(measured), dtype=np.uint32), measured)
     pictures = (PictureBorders.of(camera, config.rasterizer, 1.0) for camera in cameras)
-    return max(len(table.seen(partial(visible, each), lambda _: still, still, updates)) for each in pictures)
+    return max(len(table.seen(partial(visible, each))) for each in pictures)
 
 
 UNLIMITED = HostMemory()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stress_culling import paths
 
-from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
+from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step, rounded_share
 from clsplat.config.training import OptimiserConfig
 from clsplat.layouts.columns import CHUNK_ROWS
 
@@ -27,7 +27,7 @@ def test_bounds_are_those_of_the_rows(count: int) -> None:
         rows = slice(chunk * CHUNK_ROWS, (chunk + 1) * CHUNK_ROWS)
         assert (bounds.lowest[chunk] == means[rows].min(axis=0)).all()
         assert (bounds.highest[chunk] == means[rows].max(axis=0)).all()
-        assert bounds.largest[chunk] == log_scales[rows].max()
+        assert bounds.terms[6, chunk] == np.exp(np.float64(log_scales[rows].max()))
     assert bounds.finite.all()
 
 
@@ -44,13 +44,16 @@ def test_values_that_are_not_finite_make_a_bound_that_is_not(value: float, which
 
 
 def test_each_chunk_widens_by_its_own_step() -> None:
-    bounds = ChunkBounds(np.array([[0.0, 1, 2], [3, 4, 5]]), np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([-1.0, -2]))
+    sides = np.array([[0.0, 1, 2], [3, 4, 5]]), np.array([[1.0, 2, 3], [4, 5, 6]])
+    bounds = ChunkBounds.of_sides(*sides, np.array([-1.0, -2]))
     wide = bounds.widened(np.array([0.0, 0.5]), 0.25)
     assert (wide.lowest == [[0, 1, 2], [2.5, 3.5, 4.5]]).all()
     assert (wide.highest == [[1, 2, 3], [4.5, 5.5, 6.5]]).all()
-    assert (wide.largest == [-0.75, -1.75]).all()
+    np.testing.assert_allclose(wide.terms[6], np.exp([-0.75, -1.75]), rtol=1e-15)  # three roundings
+    assert (wide.terms[7] == [6, 16.5]).all(), "the sum of the coordinates of the farthest corner"
     assert not bounds.widened(math.inf, 0.0).finite.any()
-    assert not bounds.widened(0.0, 0.0, 1 << 24).finite.any()
+    assert not bounds.with_rounding(1 << 24).finite.any()
+    assert rounded_share(1 << 24) == math.inf
 
 
 def test_rounding_of_each_update_is_in_the_widened_bounds() -> None:
@@ -59,9 +62,22 @@ def test_rounding_of_each_update_is_in_the_widened_bounds() -> None:
     value = start
     for _ in range(500):
         value = np.float32(value + np.float32(step))
-    bounds = ChunkBounds(np.full((1, 3), start, np.float64), np.full((1, 3), start, np.float64), np.zeros(1))
+    bounds = ChunkBounds.of_sides(np.full((1, 3), start, np.float64), np.full((1, 3), start, np.float64), np.zeros(1))
     assert value > bounds.widened(500 * step, 0.0).highest[0, 0]
-    assert value <= bounds.widened(500 * step, 0.0, 500).highest[0, 0] < start + 3 * 500 * step
+    wide = bounds.with_rounding(500).widened(500 * step * rounded_share(500), 0.0)
+    assert value <= wide.highest[0, 0] < start + 3 * 500 * step
+
+
+def test_rounding_of_log_scales_is_in_the_widened_bounds() -> None:
+    """As above, of a log scale of -20, for which float32 has steps of 2^-19."""
+    start, step = np.float32(-20.0), 1.01 * 2.0**-20
+    value = start
+    for _ in range(500):
+        value = np.float32(value + np.float32(step))
+    bounds = ChunkBounds.of_sides(np.zeros((1, 3)), np.zeros((1, 3)), np.array([start], np.float64))
+    assert value > np.log(bounds.widened(0.0, 500 * step).terms[6, 0])
+    wide = bounds.with_rounding(500).widened(0.0, 500 * step * rounded_share(500))
+    assert value <= np.log(wide.terms[6, 0]) < start + 3 * 500 * step
 
 
 def test_the_bounds_with_the_defaults() -> None:

@@ -13,7 +13,7 @@ from stress_culling import KINDS, rows_of
 from clsplat.arrays import Bool, Float32, Float64
 from clsplat.camera import Camera
 from clsplat.chunks import bounds_table
-from clsplat.chunks.bounds import ChunkBounds
+from clsplat.chunks.bounds import ChunkBounds, rounded_share
 from clsplat.chunks.bounds_table import BoundsTable
 from clsplat.chunks.culling import PictureBorders, visible
 
@@ -46,7 +46,8 @@ def boxes(rng: np.random.Generator, camera: Camera) -> Float32:
 def each_chunk(found: Float32, moved: Float64, picture: PictureBorders) -> np.ndarray:
     """The chunks in view, each looked at."""
     rows = found.astype(np.float64)
-    bounds = ChunkBounds(rows[:, :3], rows[:, 3:6], rows[:, 6]).widened(*moved, UPDATES)
+    bounds = ChunkBounds.of_sides(rows[:, :3], rows[:, 3:6], rows[:, 6]).with_rounding(UPDATES)
+    bounds = bounds.widened(*(rounded_share(UPDATES) * moved))
     return np.flatnonzero(visible(picture, bounds))
 
 
@@ -61,11 +62,6 @@ class Looks:
         return visible(self.picture, bounds)
 
 
-def none_hidden(chunks: np.ndarray) -> Float64:
-    return np.zeros((2, len(chunks)))
-
-
-NONE = np.zeros((2, 1))
 NONE_MISSED = np.zeros((2, CHUNKS))
 
 
@@ -83,7 +79,7 @@ def test_the_chunks_are_those_of_a_look_at_each(kind: str) -> None:
             found[rng.integers(CHUNKS, size=9), 6] = rng.choice([20.0, 100.0, 800.0], 9)
         scale = np.array([[10.0 ** rng.uniform(-6, 0)], [0.1]]) * (case % 3 > 0)
         moved, hidden = scale * rng.random((2, CHUNKS)), scale * rng.random((2, CHUNKS))
-        table = BoundsTable(CHUNKS)
+        table = BoundsTable(CHUNKS, UPDATES)
         table.measure(of(np.arange(CHUNKS)), found)
         table.move(of(np.arange(CHUNKS)), moved)
         picture = PictureBorders.of(camera)
@@ -91,7 +87,6 @@ def test_the_chunks_are_those_of_a_look_at_each(kind: str) -> None:
             partial(visible, picture),
             lambda chunks, by=hidden: by[:, chunks],
             hidden.max(axis=1, keepdims=True),
-            UPDATES,
         )
         np.testing.assert_array_equal(got, each_chunk(found, moved + hidden, picture))
         kept += len(got)
@@ -108,22 +103,22 @@ def beside_and_in_view() -> tuple[Float32, Float32, PictureBorders]:
 
 def test_chunks_that_are_not_measured_are_in_view() -> None:
     beside, _, picture = beside_and_in_view()
-    table, looks = BoundsTable(CHUNKS), Looks(picture)
-    assert len(table.seen(looks, none_hidden, NONE, 0)) == CHUNKS
+    table, looks = BoundsTable(CHUNKS, 0), Looks(picture)
+    assert len(table.seen(looks)) == CHUNKS
     numbers = of(np.delete(np.arange(CHUNKS), [500, 1002]))
     table.measure(numbers, np.tile(beside, (len(numbers), 1)))
-    assert table.seen(looks, none_hidden, NONE, 0).tolist() == [500, 1002]
+    assert table.seen(looks).tolist() == [500, 1002]
 
 
 def test_a_chunk_that_comes_into_view_is_found() -> None:
     """After a measurement, a movement, or steps that it has missed; other chunks are not looked at."""
     beside, inside, picture = beside_and_in_view()
-    table = BoundsTable(CHUNKS)
+    table = BoundsTable(CHUNKS, 0)
     table.measure(of(np.arange(CHUNKS)), np.tile(beside, (CHUNKS, 1)))
 
     def seen(hidden: Float64 = NONE_MISSED) -> tuple[list[int], int]:
         looks = Looks(picture)
-        found = table.seen(looks, lambda chunks: hidden[:, chunks], hidden.max(axis=1, keepdims=True), 0)
+        found = table.seen(looks, lambda chunks: hidden[:, chunks], hidden.max(axis=1, keepdims=True))
         return found.tolist(), looks.number
 
     assert seen() == ([], 16)
@@ -147,7 +142,7 @@ def test_a_chunk_that_comes_into_view_is_found() -> None:
 
 def test_a_model_without_chunks() -> None:
     beside, _, picture = beside_and_in_view()
-    table = BoundsTable(0)
+    table = BoundsTable(0, 0)
     table.measure(of([]), beside[None][:0])
     table.move(of([]), np.zeros((2, 0)))
-    assert len(table.seen(Looks(picture), none_hidden, NONE, 0)) == 0
+    assert len(table.seen(Looks(picture))) == 0

@@ -38,7 +38,7 @@ def visible(bounds: ChunkBounds, camera: Camera, config: RasterizerConfig | None
 def box(middle: np.ndarray, half: float, log_scale: float) -> ChunkBounds:
     """A cube around a point in the camera's axes of CAMERA."""
     world = np.linalg.inv(CAMERA.rotation) @ (np.asarray(middle, np.float64) - CAMERA.translation)
-    return ChunkBounds((world - half)[None], (world + half)[None], np.array([log_scale]))
+    return ChunkBounds.of_sides((world - half)[None], (world + half)[None], np.array([log_scale]))
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +113,11 @@ def test_bounds_that_are_not_finite_are_visible(name: str) -> None:
         for part in range(3):
             sides = [box([0, 0, -500], 1, -3).lowest, box([0, 0, -500], 1, -3).highest, np.array([-3.0])]
             sides[part] = np.full_like(sides[part], bad)
-            assert visible(ChunkBounds(*sides), CAMERAS[name]).all()
+            assert visible(ChunkBounds.of_sides(*sides), CAMERAS[name]).all()
 
 
 def test_a_model_without_chunks() -> None:
-    assert visible(ChunkBounds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)), CAMERA).shape == (0,)
+    assert visible(ChunkBounds.of_sides(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)), CAMERA).shape == (0,)
 
 
 def test_the_rasterizer_s_settings_count() -> None:

@@ -7,6 +7,7 @@ This module uses little of clsplat, so that other versions of clsplat can be mea
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,15 +30,20 @@ CAMERA_HEIGHT = 9.0
 
 @dataclass(frozen=True)
 class SeededArray:
-    """A parameter group of the plain, of which any rows can be made."""
+    """A parameter group of the plain, of which any rows can be made.
+
+    only: numbers of the plain's cells that the array consists of; None for the first cells.
+    """
 
     group: str
     shape: tuple[int, ...]
+    only: Sequence[int] | None = None
 
     def get_rows(self, start: int, stop: int) -> Float32:
         """Rows [start, stop), cut from whole cells."""
         cells = range(start // CELL_ROWS, -(-stop // CELL_ROWS))
-        made = np.concatenate([_cell(self.group, number, self.shape[1:]) for number in cells])
+        numbers = cells if self.only is None else [self.only[place] for place in cells]
+        made = np.concatenate([_cell(self.group, number, self.shape[1:]) for number in numbers])
         first = CELL_ROWS * cells[0]
         return made[start - first : stop - first]
 
@@ -62,17 +68,20 @@ def _every_second_bit(number: int) -> int:
     return sum((number >> 2 * bit & 1) << bit for bit in range(24))
 
 
-def write_scene(folder: Path, cells: int, views: int, *, near: bool, height: float = CAMERA_HEIGHT) -> None:
+def write_scene(
+    folder: Path, cells: int, views: int, *, near: bool, height: float = CAMERA_HEIGHT, width: int = WIDTH
+) -> None:
     """Write a COLMAP folder of cameras above the plain, which look down, with photographs of noise.
 
     near: True for cameras beside each other, as on a flight; False for cameras anywhere.
     height: of the cameras above the plain, world units.
+    width: of the photographs, pixels. It does not change what a camera sees.
     """
-    rng = np.random.default_rng(1)
+    rng, tall, focal = np.random.default_rng(1), width * HEIGHT // WIDTH, FOCAL * width / WIDTH
     sparse, images = folder / "sparse" / "0", folder / "images"
     sparse.mkdir(parents=True)
     images.mkdir()
-    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
+    camera = f"1 PINHOLE {width} {tall} {focal} {focal} {width / 2} {tall / 2}\n"
     (sparse / "cameras.txt").write_text(camera)
     lines = []
     for index in range(views):
@@ -80,7 +89,7 @@ def write_scene(folder: Path, cells: int, views: int, *, near: bool, height: flo
         x, y = CELL * _every_second_bit(number), CELL * _every_second_bit(number >> 1)
         place = f"{-x} {y} {height * CELL}"  # half a turn around x: the camera looks down
         lines.append(f"{index + 1} 0 1 0 0 {place} 1 {index:04d}.png\n\n")
-        write_image(images / f"{index:04d}.png", rng.random((HEIGHT, WIDTH, 3)).astype(np.float32))
+        write_image(images / f"{index:04d}.png", rng.random((tall, width, 3)).astype(np.float32))
     (sparse / "images.txt").write_text("".join(lines))
     points = [f"{index + 1} {index % 10} {index // 10} 0 90 90 90 0.1\n" for index in range(100)]
     (sparse / "points3D.txt").write_text("".join(points))

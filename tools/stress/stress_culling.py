@@ -23,7 +23,7 @@ from tile_boxes import reach_a_tile
 
 from clsplat.arrays import Bool, Float32, Float64
 from clsplat.camera import Camera, Window
-from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
+from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step, rounded_share
 from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, upload
@@ -247,9 +247,11 @@ def compare(
     camera = KINDS[kind](rng)
     means, quaternions, log_scales, logits, distances = rows_of(rng, camera, boxes)
     lowest, highest = means.min(axis=1).astype(np.float64), means.max(axis=1).astype(np.float64)
-    bounds = ChunkBounds(lowest, highest, log_scales.max(axis=(1, 2)).astype(np.float64))
+    bounds = ChunkBounds.of_sides(lowest, highest, log_scales.max(axis=(1, 2)).astype(np.float64))
     moved, scaled, mean_step, scale_step, steps = movements.moved(means, log_scales, distances)
-    found = visible(PictureBorders.of(camera), bounds.widened(mean_step, scale_step, steps))
+    share = rounded_share(steps)
+    widened = bounds.with_rounding(steps).widened(share * mean_step, share * scale_step)
+    found = visible(PictureBorders.of(camera), widened)
     flat = (each.reshape(boxes * ROWS, -1).astype(np.float64) for each in (moved, quaternions, scaled))
     places, turns, sizes = flat
     reached = reach(places, turns, sizes, logits.reshape(-1).astype(np.float64), camera).reshape(boxes, ROWS)

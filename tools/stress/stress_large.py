@@ -91,15 +91,24 @@ def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int,
     on_device = parse_bytes(arguments.max_device_mem, "--max-device-mem")
     device, *further = open_devices(arguments.device, memory_limit=on_device)
     trainer = Trainer(scene, config, device, further=further, memory=memory)
-    shapes = group_shapes(count, (config.sh_degree + 1) ** 2)
-    arrays: Any = {group: SeededArray(group, shape) for group, shape in shapes.items()}
-    model = trainer.model
+    take_plain(trainer, count)
+    return trainer
+
+
+def take_plain(trainer: Trainer, count: int, only: Sequence[int] | None = None) -> None:
+    """Replace a trainer's model by the plain.
+
+    count: number of Gaussians.
+    only: numbers of the cells that the model consists of; None for the first cells.
+    """
+    coefficients, model = (trainer.config.sh_degree + 1) ** 2, trainer.model
+    shapes = group_shapes(count, coefficients)
+    arrays: Any = {group: SeededArray(group, shape, only) for group, shape in shapes.items()}
     model.free()
     model.plan = trainer.planner.plan(count, trainer.strategy.needs(), trainer.components, trainer.pending.turns)
-    model.set(HostGaussians(count, (config.sh_degree + 1) ** 2, arrays, count))
+    model.set(HostGaussians(count, coefficients, arrays, count))
     for component in trainer.components:
         component.rows_moved(HostArray(np.broadcast_to(np.uint32(0), count)))
-    return trainer
 
 
 def changed_rows(count: int, share: float) -> NDArray[np.uint32]:

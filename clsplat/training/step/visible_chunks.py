@@ -7,14 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
+from clsplat.chunks.bounds import largest_resumed_step, measured_sides
 from clsplat.chunks.bounds_table import BoundsTable, Movement
 from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.chunks.division import chunks_of
@@ -32,9 +31,9 @@ from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
-from clsplat.training.learning_rates import largest_rates, scaled, scaled_rates
 from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import PlacedChunks, ViewInputs
+from clsplat.training.step.movement import MovementLimits
 
 STEPS_PER_MEASUREMENT = 16
 """Number of steps after which the bounds of the chunks that took part in them are measured again. With more steps,
@@ -117,18 +116,12 @@ class VisibleChunks(Component):
         count: int,
         next_cameras: Callable[[bool], Sequence[Camera]],
     ) -> None:
-        self._config, self._rasterizer, self._unit, self._next_cameras = config, rasterizer, unit, next_cameras
-        self._optimiser = scaled(config.optimiser, config.batch)
+        self._config, self._rasterizer, self._next_cameras = config, rasterizer, next_cameras
+        self._limits = MovementLimits(config, unit)
         self._borders = lru_cache(_KEPT_BORDERS)(PictureBorders.of)
         self._ahead: dict[tuple[Camera, int, BoundsTable], NDArray[np.uint32]] = {}
         """Chunks that a view of the next step may show, by its camera, the step's number and the bounds."""
-        self._limit_movement(largest_step(self._optimiser))
         self._begin(count, 0)
-
-    def _limit_movement(self, limit: float) -> None:
-        """Set the limit of a parameter's movement in one step of Adam, as a multiple of the learning rate."""
-        self._step_limit = limit
-        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._optimiser, limit)
 
     def _begin(self, count: int, step: int, chunks: int = 0) -> None:
         """Forget all bounds. The model has `count` Gaussians, and all have taken step number `step`.
@@ -137,7 +130,8 @@ class VisibleChunks(Component):
         """
         chunks = chunks or chunks_of(count)
         self._count = count
-        self._found = BoundsTable(chunks)
+        missed = 0 if self._config.optimiser.sparse else MOST_MISSED_STEPS
+        self._found = BoundsTable(chunks, missed + STEPS_PER_MEASUREMENT)
         self._unmeasured = np.ones(chunks, np.bool_)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
@@ -146,8 +140,9 @@ class VisibleChunks(Component):
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
         self._begin_table(step, chunks)
-        self._before: dict[int, NDArray[np.uint32]] = {}
-        """For each of the latest steps, by number, the value of `_last` before it, because the step may be repeated."""
+        self._before: dict[int, tuple[NDArray[np.uint32], NDArray[np.uint32]]] = {}
+        """For each of the latest steps, by number, its chunks and their values in `_last` before it, because the step
+        may be repeated."""
         self._caught: DeviceArray | None = None
 
     def _divide(self, pool: ChunkPool | None) -> None:
@@ -163,12 +158,15 @@ class VisibleChunks(Component):
         """Begin an empty table of steps. All `chunks` chunks have taken step number `step`."""
         self.step, self._first_step = step, step + 1
         self._last = np.full(chunks, step, np.uint32)
+        """For each chunk the last step that it has taken. Not kept with sparse Adam, where chunks miss no step."""
+        self._oldest = step
+        """Lower limit of `_last`."""
 
     @property
     def on(self) -> bool:
         """True if steps may leave out chunks that the view does not show. Steps with the present settings then change
         the Gaussians of such chunks only by Adam, and do not read their gradients."""
-        return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
+        return runs_by_chunk(self._config, self._rasterizer.device) and self._limits.finite
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
         """True if bounds must be measured before the next step."""
@@ -177,7 +175,8 @@ class VisibleChunks(Component):
     @property
     def reads_all_rows(self) -> bool:
         """True if some chunk has missed so many steps that all chunks are caught up before bounds are next measured."""
-        return self.step - int(self._last.min(initial=self.step)) >= MOST_MISSED_STEPS
+        oldest = self.step if self._config.optimiser.sparse else int(self._last.min(initial=self.step))
+        return self.step - oldest >= MOST_MISSED_STEPS
 
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Measure the bounds of chunks whose Gaussians may have moved."""
@@ -188,7 +187,7 @@ class VisibleChunks(Component):
         self._before_view = None if pool is None else pool.before_view
         if pool is not None:
             pool.cull = self.in_view
-        self._since = 0
+        self._since, self._oldest = 0, int(self._last.min(initial=self.step))
         numbers = np.flatnonzero(self._unmeasured).astype(np.uint32)
         if len(numbers) == 0:
             return
@@ -207,8 +206,7 @@ class VisibleChunks(Component):
         for place in np.flatnonzero(~there):
             rows = store.starts[numbers[place] : numbers[place] + 2].tolist()
             means, log_scales = (store.get_rows(f"parameters/{group}", *rows) for group in _BOUNDED_GROUPS)
-            one = ChunkBounds.measured(means, log_scales)
-            found[place] = np.concatenate([one.lowest[0], one.highest[0], one.largest])
+            found[place] = measured_sides(means, log_scales)[0]
         return found
 
     def _measured_on_device(self, gaussians: DeviceGaussians, numbers: NDArray[np.uint32]) -> Float32:
@@ -240,14 +238,13 @@ class VisibleChunks(Component):
         self._since += 1
         if whole:
             numbers = np.arange(len(self._last), dtype=np.uint32)
-        self._note_movement(numbers, hidden(numbers))
-        self._found.move(numbers, self._step_limit * self._mean_and_scale_rates(range(step, step + 1)))
+        moved = self._limits.in_step(step)
+        self._note_movement(numbers, moved if hidden is None else moved + hidden(numbers))
         missed = self._missed(numbers, step - 1)
         of_step = _ChunksInView(self, numbers, numbers, missed, self._found, whole=whole)
-        return [
-            replace(each, chunks=of_step if len(inputs) == 1 else replace(of_step, in_view=found))
-            for each, found in zip(inputs, by_view, strict=True)
-        ]
+        for each, found in zip(inputs, by_view, strict=True):
+            each.chunks = of_step if len(inputs) == 1 else replace(of_step, in_view=found)
+        return inputs
 
     def after_adam(self, gaussians: AnyGaussians) -> None:
         """Find the chunks that the next step's views may show, while the device still computes the step just launched.
@@ -269,52 +266,40 @@ class VisibleChunks(Component):
         """Numbers of the chunks that a camera may show after the last step."""
         return self._shown_by(camera, 1.0, *self._hidden_movement(self.step + 1))
 
-    def _shown(self, camera: Camera, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
+    def _shown(self, camera: Camera, step: int, hidden: Movement | None, most: Float64 | float) -> NDArray[np.uint32]:
         """Chunks that the view of a camera may show in step number `step`, in rising order.
 
-        hidden: function that returns the limits of the movement of chunks in the steps that they missed.
-        most: (2, 1), the largest of these limits.
+        hidden, most: results of `_hidden_movement`.
         """
         thinning = thinning_of(self._config, step)
         return self._shown_by(camera, 1.0 if thinning is None else thinning.factor, hidden, most)
 
-    def _shown_by(self, camera: Camera, factor: float, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """Chunks that a camera may show if opacities are multiplied by `factor`.
-
-        hidden: function that returns the limits of the movement of chunks in the steps that they missed.
-        most: (2, 1), the largest of these limits.
-        """
+    def _shown_by(
+        self, camera: Camera, factor: float, hidden: Movement | None, most: Float64 | float
+    ) -> NDArray[np.uint32]:
+        """Chunks that a camera may show if opacities are multiplied by `factor`. hidden, most: as for `_shown`."""
         picture = self._borders(camera, self._config.rasterizer, factor)
-        return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
+        return self._found.seen(partial(visible, picture), hidden, most)
 
-    def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
+    def _hidden_movement(self, step: int) -> tuple[Movement | None, Float64 | float]:
         """Compute limits of the movement of means and log scales in missed steps, before step number `step`.
 
-        Returns a function from chunk numbers (n,) to these limits (2, n), and the largest limits of all chunks (2, 1).
+        Returns a function from chunk numbers (n,) to these limits (2, n), and an upper limit of all of them (2, 1).
+        With sparse Adam, which moves no hidden Gaussian, these are None and 0.
         """
-        longest = np.argmin(self._last, axis=0, keepdims=True)
-        rates = self._mean_and_scale_rates(range(min(int(self._last[longest[0]]), step - 1) + 1, step + 1))
-
-        def hidden(chunks: NDArray[np.integer]) -> Float64:
-            path = np.minimum(self._step_limit * (step - 1 - self._last[chunks]), self._hidden_limit)
-            return np.asarray(rates * path)
-
-        return hidden, hidden(longest)
-
-    def _mean_and_scale_rates(self, steps: range) -> Float64:
-        """Upper limits (2, 1) of the learning rates of means and log scales in the steps with the numbers `steps`."""
-        batch = self._config.batch
-        views = range((steps[0] - 1) * batch + 1, steps[-1] * batch + 1)
-        rates = scaled_rates(largest_rates(self._config, views, self._unit), batch)
-        return np.array([[rates["means"]], [rates["log_scales"]]])
+        if self._config.optimiser.sparse:
+            return None, 0.0
+        oldest = min(self._oldest, step - 1)
+        path = partial(self._limits.in_missed_steps, oldest, step)
+        return lambda chunks: path(self._last[chunks]), path(oldest)
 
     def _number(self, views: int) -> int:
         """Return Adam's number of the step that the training's view number `views` is in."""
         return -(-views // self._config.batch)
 
-    def _note_movement(self, chunks: NDArray[np.uint32], hidden: Float64) -> None:
-        """Widen the bounds of the chunks by `hidden` (2, n), the limit of their movement in missed steps."""
-        self._found.move(chunks, hidden)
+    def _note_movement(self, chunks: NDArray[np.uint32], limit: Float64) -> None:
+        """Widen the bounds of the chunks by `limit` (2, n or 1), the limit of their movement."""
+        self._found.move(chunks, limit)
         self._unmeasured[chunks] = True
 
     def _missed(self, chunks: NDArray[np.uint32], step: int) -> Missed | None:
@@ -336,11 +321,9 @@ class VisibleChunks(Component):
             chunks = _ChunksInView(self, everything, everything, None, self._found, whole=True)
         if chunks.missed is not None:
             self._catch_up(model, chunks.missed)
-        older = {number: last for number, last in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
-        self._before = {**older, step.number: self._last}
-        self._last, self.step = self._last.copy(), step.number
-        self._last[chunks.numbers] = step.number
-        self._note(step)
+        self.step = step.number
+        if not self._config.optimiser.sparse:
+            self._note(step, chunks.numbers)
         return None if chunks.whole and _pool_of(model) is None else self.place(model, chunks.numbers, "of_step")
 
     def place(self, model: tuple[AnyGaussians, ...], numbers: NDArray[np.uint32], name: str) -> PlacedChunks:
@@ -357,15 +340,16 @@ class VisibleChunks(Component):
         slots = send_chunks(work, f"slots_{name}", pool.place(numbers, changes=True), pool.rows, first_rows)
         return PlacedChunks(_in_pool(model), slots)
 
-    def _note(self, step: AdamStep) -> None:
-        """Add a step to the table of steps that chunks may have missed. If the table is full, first remove the steps
-        that all chunks have taken."""
-        if self._config.optimiser.sparse:
-            return
+    def _note(self, step: AdamStep, chunks: NDArray[np.uint32]) -> None:
+        """Record a step that chunks take, and add it to the table of steps that others may have missed. If the table is
+        full, first remove the steps that all chunks have taken."""
+        older = {number: each for number, each in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
+        self._before = {**older, step.number: (chunks, self._last[chunks])}
+        self._last[chunks] = step.number
         if step.number - self._first_step >= len(self._table):
-            # a repeated step begins with the value of `_last` in `_before`
-            oldest = min(int(last.min()) for last in (self._last, *self._before.values()))
-            past = oldest + 1 - self._first_step
+            # a repeated step begins with the values of `_last` in `_before`
+            values = (self._last, *(last for _, last in self._before.values()))
+            past = min(int(last.min(initial=step.number)) for last in values) + 1 - self._first_step
             self._table[:-past] = self._table[past:].copy()
             self._first_step += past
         self._table[step.number - self._first_step] = step_table([step])[0]
@@ -408,15 +392,17 @@ class VisibleChunks(Component):
         padded = np.full(on_device.shape, step, np.uint32)
         padded[: len(last)] = last
         on_device.send(padded)
-        catch_up(device, self._optimiser, model, chunks, on_device, caught, step, table, readback)
+        catch_up(device, self._limits.optimiser, model, chunks, on_device, caught, step, table, readback)
 
     def step_back(self, step: int) -> None:
         """Return to the state after the step that ended with view number `step`. Chunks that have been caught up since
         then are not caught up twice: the device knows the step of each."""
         step = self._number(step)
-        if step >= self.step:
-            return
-        self._last, self.step = self._before[step + 1], step
+        for number in range(self.step, step, -1) if not self._config.optimiser.sparse else ():
+            chunks, last = self._before.pop(number)
+            self._last[chunks] = last
+            self._oldest = min(self._oldest, int(last.min(initial=step)))
+        self.step = min(self.step, step)
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Catch up all chunks: take the steps of Adam that they have missed."""
@@ -424,8 +410,8 @@ class VisibleChunks(Component):
         if missed is None:
             return
         self._catch_up((parameters, first, second), missed)
-        hidden, _ = self._hidden_movement(missed.step + 1)
-        self._note_movement(missed.numbers, hidden(missed.numbers))
+        limit = self._limits.in_missed_steps(self._oldest, missed.step + 1, self._last[missed.numbers])
+        self._note_movement(missed.numbers, limit)
         self._last[missed.numbers] = missed.step
 
     def rows_changed(self, groups: set[str]) -> None:
@@ -451,7 +437,7 @@ class VisibleChunks(Component):
                 with np.errstate(divide="ignore", invalid="ignore"):
                     each = np.abs(first[group][rows]) / np.sqrt(second[group][rows])
                 ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN is 0 / 0: no gradient yet
-        self._limit_movement(largest_resumed_step(self._optimiser, ratio, self._number(step)))
+        self._limits.set(largest_resumed_step(self._limits.optimiser, ratio, self._number(step)))
         self._begin(count, self._number(step))
 
     @property
