@@ -153,13 +153,8 @@ def project(
         defines = {**out.chunk_defines, **({"SH_DEGREES": True} if "sh_degrees" in part.arrays else {})}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
-        thinned: tuple[object, ...] = ()
-        if thinning is not None:
-            defines["THINNED"] = True
-            thinned = (start, *thinning_numbers(thinning))
-            if out.chunks is not None and out.chunks.first_rows is not None:
-                defines["FIRST_ROWS"] = True
-                thinned = (0, *thinning_numbers(thinning), out.chunks.first_rows.buffer)
+        of_thinning, thinned = _thinned(thinning, start, out.chunks)
+        defines.update(of_thinning)
         rows, lanes, counted, registers = out.tile_counts.shape[0], _lanes(device), out.list_counts, 0
         if counted is not None:
             assert rows == n, "a streamed model has no passes by capacity"
@@ -186,6 +181,21 @@ def project(
         else:
             launch_groups(device, kernel, counted.sums.shape[0], device.shape.items, *arguments)
     return projected
+
+
+def _thinned(
+    thinning: Thinning | None, start: int, chunks: ChunkList | None
+) -> tuple[dict[str, object], tuple[object, ...]]:
+    """Return the defines and the kernel arguments for dropout of Gaussians in a part of a model. Both are empty without
+    dropout.
+
+    start: the part's first row in the model. chunks: the part's chunks; None for consecutive rows.
+    """
+    if thinning is None:
+        return {}, ()
+    if chunks is None or chunks.first_rows is None:
+        return {"THINNED": True}, (start, *thinning_numbers(thinning))
+    return {"THINNED": True, "FIRST_ROWS": True}, (0, *thinning_numbers(thinning), chunks.first_rows.buffer)
 
 
 def _list_counts(device: Device, work: Workspace, n: int, tiles: tuple[int, int]) -> ListCounts:

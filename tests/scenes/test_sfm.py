@@ -4,10 +4,8 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import shutil
 import sys
-from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -26,9 +24,8 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.scenes.sfm import reconstruct as sfm
-from clsplat.scenes.sfm import worker, worker_progress
+from clsplat.scenes.sfm import worker
 from clsplat.scenes.sfm.captured_files import SFM_RECORD_FILE
-from clsplat.scenes.sfm.worker_progress import UNDISTORTED_IMAGES
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
 PINHOLE = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
@@ -410,20 +407,6 @@ def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkey
     monkeypatch.setattr(sys, "executable", "/bin/false")
     refuses("structure from motion failed", sfm.reconstruct, photos, tmp_path / "out", error=ClsplatError)
     assert leftovers(tmp_path) == []
-
-
-def test_photos_are_counted_while_the_worker_moves_them_away(tmp_path, monkeypatch):
-    for name in ("a", "b"):
-        write_pixels(tmp_path / UNDISTORTED_IMAGES / name / "1.png", np.zeros((2, 2, 3), np.uint8))
-    listed = os.scandir
-
-    def moved_before(path):
-        if Path(path).name == "b":
-            Path(path).rename(tmp_path / "moved")
-        return listed(path)
-
-    monkeypatch.setattr(os, "scandir", moved_before)
-    assert worker_progress._count(tmp_path, UNDISTORTED_IMAGES) == 1
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from tiny import short
 
 from clsplat.chunks.bounds import hidden_path, largest_step
 from clsplat.config.training import OptimiserConfig
-from clsplat.training.learning_rates import rates_at, scaled, scaled_rates
+from clsplat.training.learning_rates import largest_rates, rates_at, scaled, scaled_rates
 from clsplat.training.step.movement import MovementLimits
 
 COOLED = OptimiserConfig(cooldown=100, cooldown_to=1e-4)
@@ -50,3 +50,16 @@ def test_sparse_adam_moves_no_hidden_gaussian() -> None:
     limits = MovementLimits(replace(short(iterations=20), optimiser=OptimiserConfig(sparse=True)), 1.0)
     assert not limits.in_missed_steps(0, 10, 0).any()
     assert limits.in_step(10).all()
+
+
+@pytest.mark.parametrize("end", [1e-6, 1e-3])
+def test_largest_rates_are_limits(end: float) -> None:
+    """Of means' rates that fall or rise, and of a cooldown that begins within the steps."""
+    optimiser = OptimiserConfig(means_rate=1e-4, means_rate_end=end, means_rate_steps=30, cooldown=20, cooldown_to=0.01)
+    config = replace(short(iterations=40), optimiser=optimiser)
+    for first in range(1, 40, 3):
+        steps = range(first, 41)
+        limits = largest_rates(config, steps, 2.0)
+        for name, limit in limits.items():
+            assert max(rates_at(config, step, 2.0, 1.0)[name] for step in steps) <= limit, name
+        assert largest_rates(config, range(first, first + 1), 2.0) == rates_at(config, first, 2.0, 1.0)

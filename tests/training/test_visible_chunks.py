@@ -37,7 +37,6 @@ from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training import moved_rows, trained_model
 from clsplat.training.density import ModelState, RowPlan
 from clsplat.training.density.adaptive import Adaptive
-from clsplat.training.learning_rates import largest_rates, rates_at
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.step import gradient_step, visible_chunks
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
@@ -427,19 +426,6 @@ def test_largest_contributions_are_of_the_whole_model(
         run_steps(8, trainer)
         found.append(largest_contributions(trainer, seconds=100)[0])
     np.testing.assert_array_equal(*found)
-
-
-@pytest.mark.parametrize("end", [1e-6, 1e-3])
-def test_largest_rates_are_limits(end: float) -> None:
-    """Of means' rates that fall or rise, and of a cooldown that begins within the steps."""
-    optimiser = OptimiserConfig(means_rate=1e-4, means_rate_end=end, means_rate_steps=30, cooldown=20, cooldown_to=0.01)
-    config = replace(CONFIG, optimiser=optimiser)
-    for first in range(1, 40, 3):
-        steps = range(first, 41)
-        limits = largest_rates(config, steps, 2.0)
-        for name, limit in limits.items():
-            assert max(rates_at(config, step, 2.0, 1.0)[name] for step in steps) <= limit, name
-        assert largest_rates(config, range(first, first + 1), 2.0) == rates_at(config, first, 2.0, 1.0)
 
 
 class Dims(Adaptive):

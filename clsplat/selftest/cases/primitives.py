@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, of prefix sums, of
-the pairs that the projection counts for lists by append (shared/list_counts.h), and of the lists that the stage
-`append` makes."""
+"""Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, and of prefix sums.
+Also of the pairs that the projection counts (shared/list_counts.h), and of the lists that `append` makes of them."""
 
 from __future__ import annotations
 
