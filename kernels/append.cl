@@ -122,9 +122,13 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
   __global uint *values = has_tiles ? counts : sums;
   ulong sum = 0;
   uint all, most = 0;
-  for (uint k = begin; k < end; ++k) {
-    sum += values[k];
-    most = max(most, values[k]);
+  for (uint k = begin; k < end; k += AHEAD) {
+    uint ahead[AHEAD];
+    EACH_AHEAD(i) ahead[i] = k + i < end ? values[k + i] : 0;
+    EACH_AHEAD(i) {
+      sum += ahead[i];
+      most = max(most, ahead[i]);
+    }
   }
   for (uint k = item; k < 33; k += ITEMS) places[k] = 0;
   if (item == 0) longest = 0;
@@ -144,16 +148,20 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
     }
   }
   BARRIER_LOCAL();
-  for (uint tile = begin; tile < end; ++tile) {
-    const uint length = values[tile];
-    values[tile] = before;
-    if (has_tiles) {
-      const int listed = length > 0 && !stopped;
-      ranges[2 * tile] = listed ? before : 0;
-      ranges[2 * tile + 1] = listed ? before + length : 0;
-      atomic_inc(places + clz(listed ? length : 0));
+  for (uint first = begin; first < end; first += AHEAD) {
+    uint ahead[AHEAD];
+    EACH_AHEAD(i) ahead[i] = first + i < end ? values[first + i] : 0;
+    EACH_AHEAD(i) if (first + i < end) {
+      const uint tile = first + i, length = ahead[i];
+      values[tile] = before;
+      if (has_tiles) {
+        const int listed = length > 0 && !stopped;
+        ranges[2 * tile] = listed ? before : 0;
+        ranges[2 * tile + 1] = listed ? before + length : 0;
+        atomic_inc(places + clz(listed ? length : 0));
+      }
+      before += length;
     }
-    before += length;
   }
   BARRIER_LOCAL();
   if (item == 0) {
@@ -165,7 +173,11 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
     }
   }
   BARRIER_LOCAL();
-  for (uint k = begin; k < end_of_tiles; ++k) order[atomic_inc(places + clz(ranges[2 * k + 1] - ranges[2 * k]))] = k;
+  for (uint k = begin; k < end_of_tiles; k += AHEAD) {
+    uint ahead[AHEAD];
+    EACH_AHEAD(i) if (k + i < end_of_tiles) ahead[i] = ranges[2 * (k + i) + 1] - ranges[2 * (k + i)];
+    EACH_AHEAD(i) if (k + i < end_of_tiles) order[atomic_inc(places + clz(ahead[i]))] = k + i;
+  }
 }
 
 // Appends the pair of `slot` and the local variable `depth` to the list of `tile`. gaussian: the Gaussian's index.

@@ -36,6 +36,9 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   const size_t row = ROW_OF_MODEL(i);
+  // Read before any is written, and without a branch: a compiler moves no load before a store, and may move one into a
+  // branch. So a GPU waits for these loads together.
+  const float sum = gradient_sums[row], views = seen[row], largest = radii[row];
   const float norm = ndc_norm(screen, i, x_scale, y_scale);
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
 #ifdef RAYS
@@ -46,10 +49,10 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   const float l11 = splat[SPLAT_L11] / WHITEN, l12 = splat[SPLAT_L12] / WHITEN, l22 = splat[SPLAT_L22] / WHITEN;
   const float radius = ceil(3.0f * sqrt(larger_eigenvalue(l11, l12, l22)));
 #endif
-  if (!(norm < INFINITY && radius < INFINITY)) return;
-  gradient_sums[row] += norm;
-  seen[row] += 1.0f;
-  radii[row] = radii[row] > radius ? radii[row] : radius;
+  const int counts = norm < INFINITY && radius < INFINITY;
+  gradient_sums[row] = counts ? sum + norm : sum;
+  seen[row] = counts ? views + 1.0f : views;
+  radii[row] = counts && !(largest > radius) ? radius : largest;
 }
 
 // Adds a view to the statistics of contributions. contributions (n): the Gaussians' contributions to this view, in

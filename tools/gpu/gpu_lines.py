@@ -18,7 +18,8 @@ APART: tuple[tuple[str, str, float | Callable[[Run], float]], ...] = (
     (r"\bf\[0\]", "", 4 * 45),
     (r"splat\[|rgb\[|fields\[k\]", "", 64),
     (r"\+= slot\[|\[place\]|\[from\]|pair_ids\[pair_from|slots\[i\]|\[order\[|tile_counts\[i\];", "", 128),
-    (r"APPEND\(|atomic_inc\((lengths|counts|places)|gaussian_from_slot\[|max\(most|values\[tile\]", "", 128),
+    (r"APPEND\(|atomic_inc\((lengths|counts|places)|gaussian_from_slot\[|max\(most", "", 128),
+    (r"values\[(tile|k \+ i|first \+ i)\]", "", 128),
     (r"GATHER\(\w+, 3|FROM_CAMERA\(means|dc\[0\]", "", 12),
     (r"GATHER\(quaternions", "", 16),
 )

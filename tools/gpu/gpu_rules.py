@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from gpu_lists import AHEAD
 from gpu_run import BATCH_BACK, BLOCKS, PER_ITEM, Run
 
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
@@ -284,8 +285,14 @@ OVER_TILES = (
 
 
 def _of_run(run: Run) -> float:
-    """Elements per item in the larger of the two groups of `list_offsets`, which scan counts of tiles and sums."""
-    return max(run.elements, run.lists) / run.items
+    """Rounds of an item, each over AHEAD elements, in the larger of the two groups of `list_offsets`, which scan counts
+    of tiles and sums."""
+    return _ahead(max(run.elements, run.lists), run)
+
+
+def _ahead(number: float, run: Run) -> float:
+    """Rounds in which a group's items go over this many elements, each over AHEAD in a round."""
+    return math.ceil(math.ceil(number / run.items) / AHEAD)
 
 
 def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS") -> Rule:
@@ -326,9 +333,11 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
     ),
     "list_offsets": (  # its elements are the groups of project
-        Rule("for (uint k = begin; k < end; ++k) {", _of_run, mark=("global", 1)),
-        Rule("for (uint tile = begin; tile < end; ++tile) {", _of_run, mark=("shared", 1)),
-        Rule("for (uint k = begin; k < end_of_tiles; ++k)", lambda run: run.lists / run.items, mark=("shared", 1)),
+        Rule("for (uint k = begin; k < end; k += AHEAD) {", _of_run),
+        Rule("for (uint first = begin; first < end; first += AHEAD) {", _of_run),
+        Rule(
+            "for (uint k = begin; k < end_of_tiles; k += AHEAD) {", lambda run: math.ceil(run.lists / run.items / AHEAD)
+        ),
         Rule("atomic_max(&longest, most);", lambda run: run.wave),  # AMD's compiler loops over a wave's items
     ),
     "append_pairs": (

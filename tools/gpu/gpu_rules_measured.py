@@ -45,6 +45,11 @@ def _stepped(group: str, width: int) -> Rule:
     return Rule(f"STEP_GROUP({group}, {width}, ", lambda run: width, mark=("global", 6))
 
 
+def _of_run(run: Run) -> float:
+    """Elements per item in the larger of the two groups of `list_offsets`."""
+    return max(run.elements, run.lists) / run.items
+
+
 MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
     "5ea10cd9": {
         "target": (),
@@ -122,6 +127,12 @@ MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
             ),
             Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
             SHARED_COLUMNS,
+        ),
+        "list_offsets": (
+            Rule("for (uint k = begin; k < end; ++k) {", _of_run, mark=("global", 1)),
+            Rule("for (uint tile = begin; tile < end; ++tile) {", _of_run, mark=("shared", 1)),
+            Rule("for (uint k = begin; k < end_of_tiles; ++k)", lambda run: run.lists / run.items, mark=("shared", 1)),
+            Rule("atomic_max(&longest, most);", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         ),
         "project_step": (
             REFINED,
