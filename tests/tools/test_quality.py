@@ -94,6 +94,9 @@ def test_the_table_tries_what_auto_takes() -> None:
     assert parsed(words_of(AUTO[1].removeprefix("auto:"), iterations=7000)) == config
 
 
+SMALL_TOWN = ("--town", "1x1", "--town-photos", "16", "--town-size", "64x40", "--gaussians", "900")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_makes_its_table(
@@ -109,18 +112,8 @@ def test_an_experiment_makes_its_table(
         "exposure": ["--appearance", "ppisp", "--mixes", "0.1"],
         "poses": ["--width", "40"],
         "towns": ["--towns", "1x1", "--scaled", "1x1", "--town-photos", "9", "--town-size", "32x20", "--own-block"],
-        "blocks": [
-            "--town",
-            "1x1",
-            "--town-photos",
-            "16",
-            "--town-size",
-            "64x40",
-            "--blocks",
-            "2",
-            "--gaussians",
-            "900",
-        ],
+        "blocks": [*SMALL_TOWN, "--blocks", "2"],
+        "borders": [*SMALL_TOWN, "--blocks", "4", "--seeds", "0,1"],
     }
     words = [name, str(tmp_path / "out"), *scenes, "--iterations", "2", *more.get(name, ())]
     status = main(words)

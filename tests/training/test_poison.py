@@ -97,6 +97,14 @@ def started(scene: Scene, device: Device, config: TrainConfig | None = None) -> 
     return trained_to(3, scene, config or quiet(), device)
 
 
+@pytest.fixture(scope="module")
+def plain(scene: Scene, default_device: Device) -> Trainer:
+    """A training after one step in which nothing was poisoned; not to be changed."""
+    trainer = started(scene, default_device)
+    trainer.train_step()
+    return trainer
+
+
 def put(array: DeviceArray, value: float, row: int = ROW) -> None:
     """Into the last element of a row: of a quaternion's, the first has no gradient while the others are 0."""
     values = array.get()
@@ -177,14 +185,13 @@ def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: s
 
 @pytest.mark.parametrize("group", PARAMETER_GROUPS)
 def test_a_broken_gradient_costs_its_gaussian_alone(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, group: str
+    scene: Scene, default_device: Device, plain: Trainer, monkeypatch: pytest.MonkeyPatch, group: str
 ) -> None:
     for value in (*BROKEN, 1e30):
-        poisoned, plain = started(scene, default_device), started(scene, default_device)
+        poisoned = started(scene, default_device)
         poison_gradients(poisoned, monkeypatch, group, value)
         before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
         poisoned.train_step()
-        plain.train_step()
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before, "it was not moved"
         assert_others_alike(poisoned, plain)
         poisoned.repair(look=True)
@@ -200,15 +207,16 @@ def test_a_broken_gradient_costs_its_gaussian_alone(
 
 @pytest.mark.parametrize("group", PARAMETER_GROUPS)
 @pytest.mark.parametrize("which", ["first", "second"])
-def test_broken_moments_begin_again(scene: Scene, default_device: Device, which: str, group: str) -> None:
+def test_broken_moments_begin_again(
+    scene: Scene, default_device: Device, plain: Trainer, which: str, group: str
+) -> None:
     for value in (*BROKEN, -5.0):
         if which == "first" and value == -5.0:
             continue  # that is a moment as good as any
-        poisoned, plain = started(scene, default_device), started(scene, default_device)
+        poisoned = started(scene, default_device)
         put(poisoned.model.kinds()[which][group], value)
         before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
         poisoned.train_step()
-        plain.train_step()
         assert_others_alike(poisoned, plain)
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before
         for moments in (poisoned.model.first, poisoned.model.second):
@@ -222,12 +230,13 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
 
 @pytest.mark.parametrize("group", PARAMETER_GROUPS)
 @pytest.mark.parametrize("which", ["parameters", "first", "second"])
-def test_garbage_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
+def test_garbage_spoils_nothing_else(
+    scene: Scene, default_device: Device, plain: Trainer, which: str, group: str
+) -> None:
     for value in GARBAGE:
-        poisoned, plain = started(scene, default_device), started(scene, default_device)
+        poisoned = started(scene, default_device)
         put(poisoned.model.kinds()[which][group], value)
         assert np.isfinite(poisoned.train_step().read()).all(), value
-        plain.train_step()
         if which != "parameters":  # garbage there is drawn, and has its place in the others' gradients
             assert_others_alike(poisoned, plain)
         for _ in range(3):
@@ -267,7 +276,7 @@ def after(monkeypatch: pytest.MonkeyPatch, name: str, spoil: Callable[[object], 
 @pytest.mark.parametrize("value", BROKEN)
 @pytest.mark.parametrize("where", ["target", "loss"])
 def test_a_broken_loss_is_no_fault_of_the_gaussians(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, where: str, value: float
+    scene: Scene, default_device: Device, plain: Trainer, monkeypatch: pytest.MonkeyPatch, where: str, value: float
 ) -> None:
     """A pixel of the photograph, or of the gradient together with the sums as such a pixel leaves them."""
 
@@ -284,11 +293,10 @@ def test_a_broken_loss_is_no_fault_of_the_gaussians(
             values.reshape(3, -1)[1, 20 * 48 + 24 if values.size > 5000 else 20] = value
             array.set(values)
 
-    poisoned, plain = started(scene, default_device), started(scene, default_device)
+    poisoned = started(scene, default_device)
     after(monkeypatch, where, spoil)
     result = poisoned.train_step()
     assert not np.isfinite(result.read()).all()
-    plain.train_step()
     moved = (poisoned.parameters["means"].get() != plain.parameters["means"].get()).any(axis=1).sum()
     assert moved > 0
     assert moved < 40 or where == "target", "without SSIM's windows most Gaussians are out of the pixel's reach"
@@ -302,9 +310,9 @@ def test_a_broken_loss_is_no_fault_of_the_gaussians(
 
 @pytest.mark.parametrize("value", BROKEN)
 def test_a_broken_slot_costs_its_gaussian_alone(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, value: float
+    scene: Scene, default_device: Device, plain: Trainer, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    poisoned, plain = started(scene, default_device), started(scene, default_device)
+    poisoned = started(scene, default_device)
     real = poisoned.rasterizer.pair_gradients
 
     def spoilt(frame: object, *arguments: object, **options: object) -> object:
@@ -318,7 +326,6 @@ def test_a_broken_slot_costs_its_gaussian_alone(
     monkeypatch.setattr(poisoned.rasterizer, "pair_gradients", spoilt)
     poisoned.train_step()
     monkeypatch.undo()
-    plain.train_step()
     assert_others_alike(poisoned, plain)
     poisoned.train_step()
     poisoned.repair()
