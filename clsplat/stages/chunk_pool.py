@@ -131,7 +131,9 @@ class ChunkPool:
         scratch file already.
         """
         expected, self.expected = self.expected, self.expected[:0]
-        self.store.read_ahead(expected[self._residency.slots_of(expected) < 0])
+        missing = expected[self._residency.slots_of(expected) < 0]
+        if len(missing):
+            self.store.read_ahead(missing)
         if self._mark is not None and self._copies.overlaps and len(expected) <= self.slots:
             mark, uses = self._mark
             moves = self._residency.plan_ahead(expected, uses)
