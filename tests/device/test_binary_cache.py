@@ -60,7 +60,7 @@ def test_what_is_loaded_computes_the_same(fresh: Device) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stem", "shared"), [("ranges", True), ("project", True), ("sort_radix", False), ("blend", False), ("loss", False)]
+    ("stem", "shared"), [("ranges", True), ("density", True), ("sort_radix", False), ("blend", False), ("loss", False)]
 )
 def test_shapes_share_a_file_that_does_not_name_what_they_differ_in(
     stem: str, shared: bool, default_device: Device, monkeypatch: pytest.MonkeyPatch
@@ -75,7 +75,7 @@ def test_shapes_share_a_file_that_does_not_name_what_they_differ_in(
     for shape in ("1x32", "1x64"):
         refuses("not built", default_device.with_shape(shape)._built, stem, {}, error=DriverError)
     assert (asked[0].digest == asked[1].digest) is shared
-    assert ("-DLANES=1" in asked[0].options) == (stem in {"project", "blend", "loss"})
+    assert ("-DLANES=1" in asked[0].options) == (stem in {"density", "blend", "loss"})
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "changed"])
