@@ -26,28 +26,29 @@
 #include "shared/random.h"
 #endif
 
-__kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
-                      __constant float *camera, __global const float *means, __global const float *quaternions,
-                      __global const float *log_scales, __global const float *opacity_logits,
-                      __global const float *sh_dc, __global const shT *sh_rest, __global float *splats,
-                      __global uint *tile_counts
+COUNTING_GROUP __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
+                                     __constant float *camera, __global const float *means,
+                                     __global const float *quaternions, __global const float *log_scales,
+                                     __global const float *opacity_logits, __global const float *sh_dc,
+                                     __global const shT *sh_rest, __global float *splats, __global uint *tile_counts
 #ifdef NO_FRUSTUM_CULL
-                      ,
-                      __global uint *shown
+                                     ,
+                                     __global uint *shown
 #endif
 #ifdef SH_DEGREES
-                      ,
-                      __global const uchar *sh_degrees
+                                     ,
+                                     __global const uchar *sh_degrees
 #endif
 #ifdef THINNED
-                      ,
-                      const uint model_row, const uint key0, const uint key1, const uint threshold, const float factor
+                                     ,
+                                     const uint model_row, const uint key0, const uint key1, const uint threshold,
+                                     const float factor
 #ifdef FIRST_ROWS
-                      ,
-                      __global const uint *first_rows
+                                     ,
+                                     __global const uint *first_rows
 #endif
 #endif
-                          CHUNK_PARAMETERS COUNT_PARAMETERS) {
+                                         CHUNK_PARAMETERS COUNT_PARAMETERS) {
   BEGIN_COUNTS
 #ifdef CHUNKS
   const uint first = get_global_id(0) * LANES;

@@ -61,25 +61,24 @@ static inline void store_box(const Box *t, int width, int height, int tiles_x, i
   splat[RAY_ROWS] = as_float((uint)y0 | (uint)y1 << 16);
 }
 
-__kernel void project_rays(const uint n, const int coefficients, const int width, const int height,
-                           __constant float *camera, __global const float *means, __global const float *quaternions,
-                           __global const float *log_scales, __global const float *opacity_logits,
-                           __global const float *sh_dc, __global const shT *sh_rest, __global float *splats,
-                           __global uint *tile_counts
+COUNTING_GROUP __kernel void
+project_rays(const uint n, const int coefficients, const int width, const int height, __constant float *camera,
+             __global const float *means, __global const float *quaternions, __global const float *log_scales,
+             __global const float *opacity_logits, __global const float *sh_dc, __global const shT *sh_rest,
+             __global float *splats, __global uint *tile_counts
 #ifdef SH_DEGREES
-                           ,
-                           __global const uchar *sh_degrees
+             ,
+             __global const uchar *sh_degrees
 #endif
 #ifdef THINNED
-                           ,
-                           const uint model_row, const uint key0, const uint key1, const uint threshold,
-                           const float factor
+             ,
+             const uint model_row, const uint key0, const uint key1, const uint threshold, const float factor
 #ifdef FIRST_ROWS
-                           ,
-                           __global const uint *first_rows
+             ,
+             __global const uint *first_rows
 #endif
 #endif
-                               CHUNK_PARAMETERS COUNT_PARAMETERS) {
+                 CHUNK_PARAMETERS COUNT_PARAMETERS) {
   BEGIN_COUNTS
   const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
   const size_t i = get_global_id(0);

@@ -70,6 +70,8 @@ class ChunkPool:
         self._mark: tuple[Any, int] | None = None
         """Event of a marker on the device's queue, and `Residency.uses` at that time. Later launches have used only the
         slots of chunks that were placed since. None if other slots may have been used."""
+        self._placed = False
+        """True if chunks were placed since the last `fetch_ahead`. Launches of this step may still use their slots."""
 
     def resize(self, rows: int) -> None:
         """Replace the slots by empty slots for `rows` Gaussians, after writing changed chunks back. Raises WriteError.
@@ -104,12 +106,13 @@ class ChunkPool:
 
         changes: True if the device will change the chunks.
 
-        Raises WriteError and ScratchError, and ValueError for more chunks than slots. After an error all chunks are
-        unchanged, on the device and in the store.
+        Raises WriteError and ScratchError, and ValueError for more chunks than slots. After an error no change is lost:
+        the latest state of each chunk is on the device or in the store.
         """
         moves = self._residency.plan(numbers)
-        if self._mark is None:
+        if self._mark is None and not self._placed:
             self._mark = self._device.mark(), self._residency.uses
+        self._placed = True
         if len(moves.fetched):
             self._move(moves, self._device.mark())
         self._copies.join()
@@ -141,7 +144,7 @@ class ChunkPool:
                 if len(moves.fetched):
                     self._move(moves, mark)
                 self._residency.use(moves)
-        self._mark = self._device.mark(), self._residency.uses
+        self._mark, self._placed = (self._device.mark(), self._residency.uses), False
 
     def _move(self, moves: Moves, mark: Any) -> None:
         """Carry out a plan's copies, after an event of the device's queue. Raises WriteError and ScratchError."""

@@ -156,10 +156,9 @@ def project(
         of_thinning, thinned = _thinned(thinning, start, out.chunks)
         defines.update(of_thinning)
         rows, lanes, counted, registers = out.tile_counts.shape[0], _lanes(device), out.list_counts, 0
-        defines["ITEMS"] = DEFAULT_GROUP_ITEMS  # in every shape, so that shapes share a build
         if counted is not None:
             assert rows == n, "a streamed model has no passes by capacity"
-            lanes, defines["ITEMS"], defines["COUNTS_LISTS"] = 1, device.shape.items, True
+            lanes, defines["COUNTS_LISTS"] = 1, True
             registers = COUNTING_REGISTERS if out.chunks is None else COUNTING_REGISTERS_OF_CHUNKS
         stem = "project_rays" if rays else "project"
         kernel = getattr(device.kernels(stem, {**defines, "LANES": lanes}, registers), stem)

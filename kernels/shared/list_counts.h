@@ -7,10 +7,11 @@
 // Number of items that share a row of tiles of a wide box.
 #define SIDE (ITEMS < 8 ? ITEMS : 8)
 
-// A projection kernel has COUNT_PARAMETERS at its end, begins with BEGIN_COUNTS and ends with COUNT_LISTS. In between
-// it uses LEAVE in place of `return`, because all items of a group must reach the barriers of COUNT_LISTS. The kernel
-// calls SET_TILE_COUNT for each Gaussian, and KEEP_ELLIPSE for each visible one.
+// A projection kernel has the attribute COUNTING_GROUP and COUNT_PARAMETERS at its end, begins with BEGIN_COUNTS and
+// ends with COUNT_LISTS. In between it uses LEAVE in place of `return`, because all items of a group must reach the
+// barriers of COUNT_LISTS. The kernel calls SET_TILE_COUNT for each Gaussian, and KEEP_ELLIPSE for each visible one.
 #ifndef COUNTS_LISTS
+#define COUNTING_GROUP
 #define COUNT_PARAMETERS
 #define BEGIN_COUNTS
 #define LEAVE return
@@ -19,6 +20,7 @@
 #define COUNT_LISTS
 #else
 #include "shared/group.h"
+#define COUNTING_GROUP GROUP
 #define COUNT_PARAMETERS , __global uint *lengths, __global uint *slots, __global uint *sums
 #define BEGIN_COUNTS                                                                                                   \
   __local GroupCounts group;                                                                                           \

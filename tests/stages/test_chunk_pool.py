@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from copy import copy
 from pathlib import Path
+from threading import Timer
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from calls import noted, raising, refuses
 from compare import assert_same_bits
@@ -349,3 +351,85 @@ def test_the_system_reads_what_has_no_slot_yet(
     pool.fetch_ahead()
     assert asked == [[4, LAST]] and (pool.slots_of(np.array([4, LAST])) < 0).all()
     pool.close()
+
+
+class Held:
+    """A pool on a device with memory of its own, and a change of a chunk that the device makes only after `release`."""
+
+    def __init__(self, device: Device, slots: int) -> None:
+        self.device = copy(device)
+        self.device.shares_memory, self.device.under_way = False, []
+        self.pool = pool_of(self.device, model_of(), None, slots)
+        self.event = cl.UserEvent(self.device.context)
+        self.timer = Timer(0.3, self.release)
+        self.new = np.full((CHUNK_ROWS, 3), 7.0, np.float32)
+
+    def change(self, slot: int, *, released: bool = True) -> None:
+        """Put a change of the chunk in a slot on the queue. released: True to make it 0.3 seconds later."""
+        means, nbytes = self.pool.arrays["parameters/means"], self.new.nbytes
+        wait = {"is_blocking": False, "wait_for": [self.event]}
+        self.kept = cl.enqueue_copy(self.device.queue, means.buffer, self.new, dst_offset=slot * nbytes, **wait)
+        self.device.queue.flush()
+        if released:
+            self.timer.start()
+
+    def release(self) -> None:
+        if self.event.command_execution_status > 0:
+            self.event.set_status(cl.command_execution_status.COMPLETE)
+
+    def stored(self, chunk: int) -> NDArray[np.float32]:
+        """Means of a chunk in the store, without those that the device has."""
+        return self.pool.store.get_rows("parameters/means", CHUNK_ROWS * chunk, CHUNK_ROWS * (chunk + 1))
+
+
+def test_chunks_that_come_ahead_do_not_wait_for_the_step(default_device: Device) -> None:
+    held = Held(default_device, SLOTS)
+    (slot,) = held.pool.place(np.array([0]), changes=True)
+    held.change(int(slot), released=False)
+    held.pool.expected = np.array([1, 2])
+    late = Timer(30, held.release)
+    late.start()
+    held.pool.fetch_ahead()
+    late.cancel()
+    assert held.event.command_execution_status > 0, "the step is still under way"
+    assert (held.pool._residency.slots_of(np.array([1, 2])) >= 0).all()
+    held.release()
+    check(held.pool, model_of() | {"parameters/means": changed_means(0)})
+
+
+def changed_means(chunk: int) -> NDArray[np.float32]:
+    """Means of the model after the change of `Held`."""
+    means = model_of()["parameters/means"]
+    means[rows_of(chunk)] = 7.0
+    return means
+
+
+@pytest.mark.parametrize("how", ["ahead", "place", "write back", "release", "filled within the step"])
+def test_a_chunk_leaves_after_what_changes_it(default_device: Device, how: str) -> None:
+    """The last launch that changes it is still to run when its copy to the store begins."""
+    held = Held(default_device, 1 if how == "place" else SLOTS)
+    pool = held.pool
+    (slot,) = pool.place(np.array([0]), changes=True)
+    if how == "filled within the step":
+        pool.place(np.array([1]), changes=True)
+        pool.fill("second/means", 0.0)
+        pool.place(np.array([1]), changes=True)
+    held.change(int(slot))
+    if how == "ahead":
+        pool.fetch_ahead()
+        pool.place(np.array([1]), changes=True)
+        pool.expected = np.array([2, 3])
+        pool.fetch_ahead()
+        assert pool.slots_of(np.array([0]))[0] < 0, "it has left"
+    elif how == "place":
+        pool.place(np.array([1]), changes=True)
+    elif how == "write back":
+        pool.write_back()
+    elif how == "release":
+        pool.release()
+    else:
+        pool.expected = np.array([2, 3])
+        pool.fetch_ahead()
+        pool.write_back()
+    held.timer.join()
+    assert_same_bits(held.stored(0), held.new)

@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 import scenes
 import test_project_rays as rays
-from calls import refuses
 from pipeline import shaped
 from quick import quick
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import BenchSwitches
-from clsplat.device import context
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.program import Variant
-from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.dropout import Thinning
@@ -30,7 +26,6 @@ from clsplat.selftest.cases.primitives import LIST_COUNTS_CASE, expected_list_co
 from clsplat.stages.chunk_lists import ChunkList, padded_chunks
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import upload_gaussians
-from clsplat.stages.project import project
 
 CONFIGS = {
     "frustum culling off": BenchSwitches(frustum_cull=False),
@@ -97,26 +92,3 @@ def test_the_case_finds_a_wrong_count(default_device: Device) -> None:
         spoilt = {key: values.copy() for key, values in read.items()}
         spoilt[name].flat[-1] += 1
         assert LIST_COUNTS_CASE.twin(given, spoilt)[name].error_of(spoilt[name]) == 1
-
-
-def test_shapes_share_the_build_of_a_projection_that_counts_no_lists(
-    default_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gaussians, camera = scene("plain")
-    asked: list[str] = []
-
-    def note(_context: object, _device: object, variant: Variant) -> None:
-        asked.append(variant.digest)
-        raise DriverError("not built")
-
-    for shape in ("1x32", "1x64"):
-        device = default_device.with_shape(shape)
-        model, on_device = upload_gaussians(device, gaussians), upload(device, pack_camera(camera))
-        with monkeypatch.context() as patch:
-            patch.setattr(context, "build", note)
-            for counts in (False, True):
-                of = (device, Workspace(device), model, camera, on_device)
-                refuses("not built", project, *of, counts_lists=counts, error=DriverError)
-    plain, counting, other_plain, other_counting = asked
-    assert plain == other_plain
-    assert len({plain, counting, other_counting}) == 3

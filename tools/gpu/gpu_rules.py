@@ -82,7 +82,7 @@ class Rule:
 
 OUTSIDE = "outside of loops"
 """Place of a branch that is in no loop."""
-_HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
+_HEADS = ("static ", "GROUP __kernel", "COUNTING_GROUP __kernel", "__kernel", "RARE ")
 """Words with which the head of a function begins."""
 
 
