@@ -6,7 +6,7 @@ from __future__ import annotations
 BROKEN = {
     "arithmetic: x / y": ("x * y", "arithmetic"),
     "project: -(p.sxy / p.syy)": ("(p.sxy / p.syy)", "project"),
-    "project: tile_counts[i] = count": ("tile_counts[i] = count + 1", "project"),
+    "project: SET_TILE_COUNT(i, count)": ("SET_TILE_COUNT(i, count + 1)", "project"),
     "duplicate: gaussian_from_visible[order[rank]]": ("gaussian_from_visible[rank]", "duplicate"),
     "duplicate: ty * tiles_x + tx": ("tx * tiles_x + ty", "duplicate"),
     "sort_radix: & (digits - 1)": ("& (digits - 2)", "sort"),
