@@ -281,9 +281,13 @@ def chunks(device: Device) -> None:
     ):
         trainer = _train(device, config, 3, view, initial=mostly_behind(view))
         (component,) = (each for each in trainer.components if isinstance(each, VisibleChunks))
-        if component._last.tolist() != [0, 0, config.iterations]:  # noqa: SLF001
-            told = f"last steps of the chunks: {component._last.tolist()}"  # noqa: SLF001
-            raise SystemExit(f"{told}, expected {[0, 0, config.iterations]}")
+        steps = [
+            0,
+            0,
+            0 if config.optimiser.sparse else config.iterations,
+        ]  # sparse Adam misses no step, and notes none
+        if component._last.tolist() != steps:  # noqa: SLF001
+            raise SystemExit(f"last steps of the chunks: {component._last.tolist()}, expected {steps}")  # noqa: SLF001
         trainer.catch_up()
         trainer.parameters["means"].get()
     for module in (visible_chunks, trained_model, moved_rows):
