@@ -3,9 +3,8 @@
 // the lists have the same order as those of duplicate.cl and ranges.cl: by depth, then by the Gaussian's index.
 //
 // Owner: In append_pairs a work-item owns a Gaussian; the items of a group share a Gaussian whose box of tiles is
-// large.
-//   In list_offsets one group owns all tiles, and a second group owns the array `sums`. In sort_lists a group owns a
-//   tile.
+//   large. In list_offsets one group owns all tiles, and a second group owns the array `sums`. In sort_lists a group
+//   owns a tile.
 // Launch: append_pairs: one work-item for each Gaussian, in groups of ITEMS; list_offsets: two groups; sort_lists: one
 //   group for each tile.
 // Buffers: splats (n, SPLAT_SIZE): in pixels, depth in world units. tile_counts (n). counts, slots and sums: of the

@@ -107,7 +107,8 @@ class ChunkBounds:
             return ChunkBounds(self.terms.copy(), self.factor).widen(mean_step, log_scale_step)
 
     def widen(self, mean_step: float | Float64, log_scale_step: float | Float64) -> ChunkBounds:
-        """Change the bounds to those that `widened` returns, and return this object. NumPy may warn of infinities."""
+        """Widen these bounds in place, and return them. The arguments are those of `widened`. NumPy may warn of
+        infinities."""
         self.terms[3:6] += mean_step
         self.terms[7] += 3 * self.factor * mean_step
         self.terms[6] *= np.exp(log_scale_step)

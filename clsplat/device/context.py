@@ -183,8 +183,8 @@ class Device:
         return any(name in self._switches for name in names)
 
     def beside(self) -> Device:
-        """Copy this device, with a second in-order queue. Its commands run beside those of the first queue, except
-        where one waits for the other (`mark`, `follow`).
+        """Copy this device, with a second in-order queue. The two queues run side by side, unless one waits for the
+        other (`mark`, `follow`).
 
         Returns this device itself if the driver has no second queue.
         """

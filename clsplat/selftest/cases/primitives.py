@@ -218,7 +218,7 @@ def read_list_counts(
 def expected_list_counts(got: Arrays) -> Mapping[str, Expected]:
     """Expect the splats of the projection that does not count, and the lengths of the lists by the radix sorts.
 
-    got: results of `read_list_counts`, from which those of the second projection are removed.
+    got: results of `read_list_counts`. The results of the second projection are removed from it.
     """
     slots, sums = group_counts(got["plain tile_counts"], int(got.pop("items")))
     lengths = [*np.diff(got.pop("ranges"), axis=1).ravel(), int(got.pop("visible"))]
